@@ -1,0 +1,54 @@
+"""What every test run shares: one thread, and clear skips where something is not installed."""
+
+import os
+
+# Before torch is imported: many small networks run fastest on one thread each.
+for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_variable] = "1"
+# Read by pytest-timeout where it is installed [s].
+os.environ.setdefault("PYTEST_TIMEOUT", "900")
+
+from functools import cache  # noqa: E402
+from importlib.util import find_spec  # noqa: E402
+
+import pytest  # noqa: E402
+import torch  # noqa: E402
+
+torch.set_num_threads(1)
+
+# Modules whose import, and so their docstrings' examples, needs an extra.
+_NEEDS = {
+    "gymnasium": ["torchrl_bmrl/envs/*"],
+    "h5py": [
+        "torchrl_bmrl/data/minari.py",
+        "torchrl_bmrl/data/robomimic.py",
+        "torchrl_bmrl/data/schema.py",
+        "torchrl_bmrl/experts/*",
+    ],
+    "matplotlib": ["torchrl_bmrl/reports/*"],
+    "robosuite": ["torchrl_bmrl/envs/*", "torchrl_bmrl/experts/*"],
+    "safetensors": ["torchrl_bmrl/checkpoint.py"],
+    "scipy": ["torchrl_bmrl/evaluation/*", "torchrl_bmrl/reports/*"],
+    "tqdm": ["torchrl_bmrl/parallel.py"],
+}
+collect_ignore_glob = sorted(
+    {glob for package, globs in _NEEDS.items() if find_spec(package) is None for glob in globs}
+)
+
+
+@cache
+def _robosuite_problem() -> str | None:
+    """Why robosuite cannot be imported, or ``None``; it is imported only once a test asks."""
+    try:
+        import robosuite  # noqa: F401
+    except Exception as error:  # a broken graphics or physics library raises what it likes
+        return f"robosuite cannot be imported ({type(error).__name__}: {error})"
+    return None
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skips what this machine cannot run."""
+    if item.get_closest_marker("gpu") and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    if item.get_closest_marker("robosuite") and (problem := _robosuite_problem()):
+        pytest.skip(problem)

@@ -1,0 +1,397 @@
+"""Tables say what the rows say, figures show their data, the page stands alone."""
+
+# ruff: noqa: E402 -- the package's imports need the extras that the skip checks
+from __future__ import annotations
+
+import csv
+import io
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+for extra in ("scipy", "matplotlib", "jinja2", "sklearn"):
+    pytest.importorskip(extra)
+
+from torchrl_bmrl.errors import BMRLError, DataError
+from torchrl_bmrl.evaluation import ResultRow, summarise, write_results
+from torchrl_bmrl.names import TASKS
+from torchrl_bmrl.reports import (
+    TASK_COLORS,
+    Embeddings,
+    Section,
+    Table,
+    embedding_scatter,
+    embedding_tsne,
+    paper,
+    reach_trajectories,
+    read_stage1_curves,
+    results_table,
+    stage1_curves,
+    table_1,
+    table_2,
+    write_page,
+    write_report,
+)
+
+ARMS = [("expert", ""), ("bcq", ""), ("distilled", "prototype"), ("distilled", "online")]
+
+
+def make_rows(tasks: tuple[str, ...] = TASKS) -> list[ResultRow]:
+    rng = np.random.default_rng(0)
+    return [
+        ResultRow(
+            task=task,
+            policy=policy,
+            latent_source=source,
+            seed=seed,
+            episode=episode,
+            episode_return=float(rng.normal(200, 20)),
+            success=bool(rng.random() < 0.8),
+        )
+        for task in tasks
+        for policy, source in ARMS
+        for seed in (0, 1)
+        for episode in range(5)
+    ]
+
+
+def make_embeddings(dim: int = 2) -> Embeddings:
+    """Six tasks of three episodes of eight steps, in a shuffled order."""
+    rng = np.random.default_rng(1)
+    task, episode, step = (a.ravel() for a in np.meshgrid(range(6), range(3), range(8)))
+    shuffle = rng.permutation(task.size)
+    task, episode, step = task[shuffle], episode[shuffle], step[shuffle]
+    latent = rng.normal(size=(task.size, dim)) + 5.0 * task[:, None]
+    return Embeddings(
+        task_latent=latent, task=task, episode=episode, step=step, distance=0.3 / (1 + step)
+    )
+
+
+def mean(rows: list[ResultRow], task: str, policy: str, source: str = "") -> float:
+    returns = [
+        r.episode_return
+        for r in rows
+        if (r.task, r.policy, r.latent_source) == (task, policy, source)
+    ]
+    return sum(returns) / len(returns)
+
+
+def cells(table: Table) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(table.csv())))
+
+
+def write_curves(run_dir: Path, task: str, rows: list[tuple[object, ...]]) -> Path:
+    path = run_dir / "bcq" / task / "evaluations.csv"
+    path.parent.mkdir(parents=True)
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([("epoch", "update", "episode", "return", "success"), *rows])
+    return path
+
+
+class Resources(HTMLParser):
+    """Everything that the page asks a browser to load, and its elements' names."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.tags: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.links += [value or "" for name, value in attrs if name in ("src", "href", "srcset")]
+
+
+# Tables
+
+
+def test_the_papers_percentages_follow_from_its_returns_but_for_two() -> None:
+    off = []
+    for task in TASKS:
+        share = paper.TABLE_2[task].distilled_return / paper.TABLE_1[task].bcq_return
+        if f"{share:.0%}" != paper.TABLE_2[task].printed_percent.rstrip("*"):
+            off.append((task, f"{share:.0%}"))
+    assert off == [("lift", "117%"), ("push_up", "97%")]
+
+
+def test_table_1_is_recomputed_from_the_rows() -> None:
+    rows = make_rows()
+    table = cells(table_1(summarise(rows), epochs={"lift": 12}))
+    for task, line in zip(TASKS, table, strict=True):
+        expert, bcq = mean(rows, task, "expert"), mean(rows, task, "bcq")
+        assert line["Here: expert"] == f"{expert:.1f}"
+        assert line["Here: BCQ"] == f"{bcq:.1f}"
+        assert line["Here: BCQ/expert"] == f"{100 * bcq / expert:.1f}%"
+        assert float(line["Paper: BCQ"]) == paper.TABLE_1[task].bcq_return
+        assert float(line["Paper: expert"]) == paper.TABLE_1[task].expert_return
+    assert [line["Here: epochs"] for line in table] == ["–", "12", "–", "–", "–", "–"]
+
+
+def test_table_2_is_recomputed_from_the_rows_for_every_source() -> None:
+    rows = make_rows()
+    table = cells(table_2(summarise(rows), default_source="prototype"))
+    for task, line in zip(TASKS, table, strict=True):
+        for source in ("prototype", "online"):
+            distilled = mean(rows, task, "distilled", source)
+            share = 100 * distilled / mean(rows, task, "bcq")
+            assert line[f"{source}: return"] == f"{distilled:.1f}"
+            assert line[f"{source}: % of BCQ"] == f"{share:.1f}%"
+        assert float(line["Paper: return"]) == paper.TABLE_2[task].distilled_return
+        assert line["Paper: % of BCQ"] == paper.TABLE_2[task].printed_percent
+
+
+def test_the_default_source_comes_first() -> None:
+    summaries = summarise(make_rows())
+    for first, second in (("online", "prototype"), ("prototype", "online")):
+        header = list(table_2(summaries, default_source=first).header)
+        assert header.index(f"{first}: return") < header.index(f"{second}: return")
+
+
+def test_results_table_holds_every_summary() -> None:
+    summaries = summarise(make_rows())
+    lines = cells(results_table(summaries))
+    assert len(lines) == len(summaries) == len(TASKS) * len(ARMS)
+    for summary, line in zip(summaries, lines, strict=True):
+        low, high = summary.return_interval
+        assert line["Mean return"] == f"{summary.mean_return:.1f}"
+        assert line["Return 95% interval"] == f"[{low:.1f}, {high:.1f}]"
+        assert line["Success"] == f"{100 * summary.success_rate:.0f}%"
+        assert (line["Source of m"], line["Episodes"], line["Seeds"]) == (
+            summary.latent_source,
+            "10",
+            "2",
+        )
+
+
+def test_what_was_not_measured_is_a_dash() -> None:
+    summaries = [s for s in summarise(make_rows(("lift",))) if s.policy != "bcq"]
+    lift = cells(table_2(summaries, default_source="prototype"))[TASKS.index("lift")]
+    assert lift["prototype: return"] != "–"
+    assert lift["prototype: % of BCQ"] == "–"
+    assert cells(table_1(summaries))[0]["Here: expert"] == "–"
+
+
+def test_markdown_html_and_csv_hold_the_same_cells() -> None:
+    table = Table(
+        title="T", caption="C", header=("A|B", "N"), rows=[("x|y", "1.5"), ("<b>", "[2, 3]")]
+    )
+    assert table.markdown().splitlines()[4:] == [
+        "| A\\|B | N |",
+        "| :--- | ---: |",
+        "| x\\|y | 1.5 |",
+        "| <b> | [2, 3] |",
+    ]
+    assert list(csv.reader(io.StringIO(table.csv()))) == [["A|B", "N"], *map(list, table.rows)]
+    html = table.html()
+    assert "<b>" not in html
+    assert re.findall(r"<t[dh]( class=\"number\")?>(.*?)</", html) == [
+        ("", "A|B"),
+        (' class="number"', "N"),
+        ("", "x|y"),
+        (' class="number"', "1.5"),
+        ("", "&lt;b&gt;"),
+        (' class="number"', "[2, 3]"),
+    ]
+
+
+# Figures
+
+
+def test_every_task_has_its_own_color() -> None:
+    assert list(TASK_COLORS) == list(TASKS)
+    assert len(set(TASK_COLORS.values())) == len(TASKS)
+
+
+def test_figures_repeat_exactly_and_change_with_the_data() -> None:
+    data = make_embeddings()
+    moved = data.task_latent + data.step[:, None]
+    curve = [(e, 10 * e, np.array([1.0 * e, 2.0 * e])) for e in (1, 2, 3)]
+    draws = [
+        lambda m: embedding_scatter(m, data.task),
+        lambda m: embedding_tsne(m, data.task, seed=0),
+        lambda m: reach_trajectories(m, data.episode, data.distance),
+        lambda m: stage1_curves({"lift": curve}, expert_means={"lift": float(m.sum())}),
+    ]
+    for draw in draws:
+        image = draw(data.task_latent)
+        assert image.startswith(b"\x89PNG")
+        assert len(image) < 300_000
+        assert draw(data.task_latent) == image
+        assert draw(moved) != image
+
+
+def test_colors_follow_task_and_distance() -> None:
+    data = make_embeddings()
+    swapped = (data.task + 1) % 6
+    assert embedding_scatter(data.task_latent, data.task) != embedding_scatter(
+        data.task_latent, swapped
+    )
+    assert reach_trajectories(data.task_latent, data.episode, data.distance) != reach_trajectories(
+        data.task_latent, data.episode, data.distance[::-1]
+    )
+
+
+@pytest.mark.parametrize("dim", [1, 3])
+def test_embeddings_of_other_sizes_are_drawn(dim: int) -> None:
+    data = make_embeddings(dim)
+    for image in (
+        embedding_scatter(data.task_latent, data.task),
+        embedding_tsne(data.task_latent[:40], data.task[:40]),
+        reach_trajectories(data.task_latent, data.episode, data.distance),
+    ):
+        assert image.startswith(b"\x89PNG")
+
+
+def test_figures_refuse_what_they_cannot_draw() -> None:
+    with pytest.raises(BMRLError, match="no curve"):
+        stage1_curves({})
+    with pytest.raises(BMRLError, match=r"\[0, 6\).*7"):
+        embedding_scatter(np.zeros((1, 2)), np.array([7]))
+    with pytest.raises(BMRLError, match="at least 4"):
+        embedding_tsne(np.zeros((3, 2)), np.zeros(3, dtype=int))
+    with pytest.raises(BMRLError, match="no trajectory"):
+        reach_trajectories(np.zeros((0, 2)), np.zeros(0, dtype=int), np.zeros(0))
+
+
+def test_embeddings_refuse_what_does_not_fit() -> None:
+    zeros = np.zeros(3, dtype=int)
+    fits: dict[str, Any] = {
+        "task_latent": np.zeros((3, 2)),
+        "task": zeros,
+        "episode": zeros,
+        "step": zeros,
+        "distance": np.zeros(3),
+    }
+    for name, value in (
+        ("task_latent", np.zeros(3)),
+        ("task_latent", np.full((3, 2), np.nan)),
+        ("step", np.zeros(4, dtype=int)),
+        ("distance", np.full(3, np.inf)),
+    ):
+        with pytest.raises(BMRLError, match=name):
+            Embeddings(**{**fits, name: value})
+
+
+# Page and report
+
+
+def test_the_page_escapes_what_it_is_given(tmp_path: Path) -> None:
+    evil = "<script>alert(1)</script>"
+    table = Table(title=evil, caption=evil, header=(evil,), rows=[(evil,)])
+    section = Section(heading=evil, paragraphs=[evil], tables=[table])
+    path = tmp_path / "page.html"
+    write_page(path, title=evil, facts={evil: evil}, sections=[section])
+    text = path.read_text(encoding="utf-8")
+    assert "script" not in Resources(text).tags
+    # title and h1, name and value of the fact, heading, paragraph, four parts of the table
+    assert text.count("&lt;script&gt;alert(1)&lt;/script&gt;") == 10
+
+
+def test_a_whole_report_is_written_and_stands_alone(tmp_path: Path) -> None:
+    write_results(tmp_path / "results.csv", make_rows())
+    for task in TASKS:
+        write_curves(tmp_path, task, [(1, 50, 0, 10.0, 0), (2, 100, 0, 20.0, 1)])
+    page = write_report(
+        tmp_path,
+        default_source="prototype",
+        facts={"seed": "0"},
+        embeddings=make_embeddings(),
+        accuracy=0.987,
+    )
+    files = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
+    assert files - {"results.csv"} - {f"bcq/{task}/evaluations.csv" for task in TASKS} == {
+        "report.html",
+        *(f"tables/{n}.{e}" for n in ("results", "table1", "table2") for e in ("md", "csv")),
+        *(
+            f"figures/{n}.png"
+            for n in ("stage1_curves", "embedding", "embedding_tsne", "reach_trajectories")
+        ),
+    }
+    text = page.read_text(encoding="utf-8")
+    resources = Resources(text)
+    assert len(resources.links) == resources.tags.count("img") == 4
+    assert all(link.startswith("data:image/png;base64,") for link in resources.links)
+    assert not re.search(r"https?:|url\(|@import", text)
+    assert {"script", "link", "iframe"}.isdisjoint(resources.tags)
+    assert "98.7%" in text
+    assert "left out" not in text
+    assert "Here: epochs" in (tmp_path / "tables" / "table1.md").read_text(encoding="utf-8")
+    epochs = [line["Here: epochs"] for line in cells_of(tmp_path / "tables" / "table1.csv")]
+    assert epochs == ["2"] * 6
+
+
+def cells_of(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
+
+
+def test_the_summary_counts_the_successes(tmp_path: Path) -> None:
+    rows = make_rows(("reach", "lift"))
+    write_results(tmp_path / "results.csv", rows)
+    text = write_report(tmp_path, default_source="online", facts={}).read_text(encoding="utf-8")
+    for policy, source in (("bcq", ""), ("distilled", "online")):
+        solved = sum(r.success for r in rows if (r.policy, r.latent_source) == (policy, source))
+        assert f"solved {solved} of 20 episodes" in text
+    shares = [mean(rows, t, "distilled", "online") / mean(rows, t, "bcq") for t in TASKS[:2]]
+    assert f"between {min(shares):.1%}" in text
+    assert f"and {max(shares):.1%}" in text
+
+
+def test_a_figure_without_data_is_left_out_and_the_page_says_so(tmp_path: Path) -> None:
+    write_results(tmp_path / "results.csv", make_rows())
+    text = write_report(tmp_path, default_source="prototype", facts={}).read_text(encoding="utf-8")
+    assert not (tmp_path / "figures").exists()
+    assert "training curves is left out" in text
+    assert "figures of the embedding are left out" in text
+    write_curves(tmp_path, "lift", [(1, 50, 0, 10.0, 0)])
+    text = write_report(tmp_path, default_source="prototype", facts={}).read_text(encoding="utf-8")
+    assert "No training curve was found for Reach, Push Right" in text
+
+
+def test_the_report_does_not_depend_on_the_order_of_transitions(tmp_path: Path) -> None:
+    write_results(tmp_path / "results.csv", make_rows())
+    data = make_embeddings()
+    order = np.random.default_rng(5).permutation(len(data.task))
+    shuffled = Embeddings(
+        task_latent=data.task_latent[order],
+        task=data.task[order],
+        episode=data.episode[order],
+        step=data.step[order],
+        distance=data.distance[order],
+    )
+    pages = [
+        write_report(tmp_path, default_source="online", facts={}, embeddings=e).read_bytes()
+        for e in (data, shuffled)
+    ]
+    assert pages[0] == pages[1]
+
+
+def test_curves_are_grouped_by_epoch_in_order(tmp_path: Path) -> None:
+    write_curves(tmp_path, "lift", [(2, 20, 0, 5.0, 1), (1, 10, 0, 1.0, 0), (1, 10, 1, 3.0, 0)])
+    curves = read_stage1_curves(tmp_path)
+    assert list(curves) == ["lift"]
+    assert [(e, u, r.tolist()) for e, u, r in curves["lift"]] == [
+        (1, 10, [1.0, 3.0]),
+        (2, 20, [5.0]),
+    ]
+
+
+def test_bad_input_leaves_the_old_report(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"results\.csv: no such file"):
+        write_report(tmp_path, default_source="online", facts={})
+    write_results(tmp_path / "results.csv", [])
+    with pytest.raises(DataError, match="holds no episode"):
+        write_report(tmp_path, default_source="online", facts={})
+    write_results(tmp_path / "results.csv", make_rows())
+    page = write_report(tmp_path, default_source="online", facts={})
+    before = page.read_bytes()
+    path = write_curves(tmp_path, "lift", [(1, 10, 0, "nan", 0)])
+    with pytest.raises(DataError, match=r"evaluations\.csv: return: .*line 2 is 'nan'"):
+        write_report(tmp_path, default_source="online", facts={"seed": "1"})
+    assert page.read_bytes() == before
+    path.write_text("epoch,episode,return\n")
+    with pytest.raises(DataError, match=r"evaluations\.csv: update: column is missing"):
+        write_report(tmp_path, default_source="online", facts={})

@@ -1,0 +1,20 @@
+"""gymnasium ids of the six tasks; importing :mod:`torchrl_bmrl.envs` registers them."""
+
+from __future__ import annotations
+
+import gymnasium
+
+from torchrl_bmrl.names import HORIZON, TASKS, gymnasium_id
+
+
+def register() -> None:
+    """Registers ``bmrl/SawyerReach-v0`` and its five siblings (idempotent)."""
+    for task in TASKS:
+        if gymnasium_id(task) not in gymnasium.registry:
+            gymnasium.register(
+                gymnasium_id(task),
+                entry_point="torchrl_bmrl.envs.tasks:SawyerEnv",
+                max_episode_steps=HORIZON,
+                kwargs={"task": task},
+                disable_env_checker=True,
+            )

@@ -1,0 +1,110 @@
+"""Errors that this library raises on purpose; all derive from :class:`BMRLError`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+
+class BMRLError(ValueError):
+    """Base of the library's errors: catch it to catch them all.
+
+    Example:
+        >>> try:
+        ...     raise ConfigError("batch_size must be positive, got 0")
+        ... except BMRLError as error:
+        ...     print(error)
+        batch_size must be positive, got 0
+    """
+
+
+class ConfigError(BMRLError):
+    """Options that are invalid, alone or together.
+
+    Example:
+        >>> raise ConfigError("pass either action_spec or bounds, not both")
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.ConfigError: pass either action_spec or bounds, not both
+    """
+
+
+class UnknownNameError(BMRLError):
+    """A name that is none of the valid choices.
+
+    Args:
+        kind: what the name stands for, such as ``"task"``.
+        value: the name that was given.
+        valid: the names that would have been accepted.
+
+    Example:
+        >>> print(UnknownNameError("task", "lft", ["reach", "lift"]))
+        unknown task 'lft'; valid tasks: reach, lift
+    """
+
+    def __init__(self, kind: str, value: object, valid: Iterable[object]) -> None:
+        self.kind = kind
+        self.value = value
+        self.valid = tuple(valid)
+        super().__init__(kind, value, self.valid)
+
+    def __str__(self) -> str:
+        choices = ", ".join(map(str, self.valid)) or "none"
+        return f"unknown {self.kind} {self.value!r}; valid {_plural(self.kind)}: {choices}"
+
+
+class DataError(BMRLError):
+    """A dataset file that is missing, damaged or not in the expected layout.
+
+    Args:
+        path: the file.
+        key: the group, dataset or attribute at fault; ``None`` for the file as a whole.
+        message: what is wrong with it.
+
+    Example:
+        >>> print(DataError("lift.hdf5", "data/demo_0/actions", "expected 7 columns, got 6"))
+        lift.hdf5: data/demo_0/actions: expected 7 columns, got 6
+    """
+
+    def __init__(self, path: str | Path, key: str | None, message: str) -> None:
+        self.path = Path(path)
+        self.key = key
+        self.message = message
+        super().__init__(path, key, message)
+
+    def __str__(self) -> str:
+        where = [str(self.path)] if self.key is None else [str(self.path), self.key]
+        return ": ".join([*where, self.message])
+
+
+class CheckpointError(BMRLError):
+    """A checkpoint that cannot be read, or does not fit the networks that it is loaded into.
+
+    Args:
+        path: the checkpoint.
+        message: what is wrong with it.
+
+    Example:
+        >>> print(CheckpointError("runs/lift/last", "no manifest"))
+        runs/lift/last: no manifest
+    """
+
+    def __init__(self, path: str | Path, message: str) -> None:
+        self.path = Path(path)
+        self.message = message
+        super().__init__(path, message)
+
+    def __str__(self) -> str:
+        return f"{self.path}: {self.message}"
+
+
+def _plural(noun: str) -> str:
+    """Regular English plural of a noun.
+
+    Example:
+        >>> [_plural(noun) for noun in ("task", "policy", "loss", "key")]
+        ['tasks', 'policies', 'losses', 'keys']
+    """
+    if noun.endswith("y") and noun[-2:-1] not in set("aeiou"):
+        return f"{noun[:-1]}ies"
+    return f"{noun}es" if noun.endswith(("s", "x", "ch", "sh")) else f"{noun}s"

@@ -1,0 +1,249 @@
+"""``results.csv``: one row per evaluated episode, from which every table is computed."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.evaluation.statistics import bootstrap_interval
+from torchrl_bmrl.files import write_atomic
+from torchrl_bmrl.names import TASKS
+
+POLICIES: tuple[str, ...] = ("expert", "bcq", "distilled")
+"""The policies that a run compares, in the order of the tables."""
+
+RESULT_FIELDS: tuple[str, ...] = (
+    "task",
+    "policy",
+    "latent_source",
+    "seed",
+    "episode",
+    "return",
+    "success",
+)
+"""Columns of ``results.csv``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultRow:
+    """One evaluated episode.
+
+    Args:
+        task: One of :data:`torchrl_bmrl.names.TASKS`.
+        policy: One of :data:`POLICIES`.
+        latent_source: Where the distilled policy took ``task_latent`` from; empty for the others.
+        seed: Seed of the training run that the policy comes from.
+        episode: Number of the episode within its task, policy, source and seed.
+        episode_return: Undiscounted sum of the rewards (column ``return``).
+        success: Whether the task's goal was met at some step.
+    """
+
+    task: str
+    policy: str
+    latent_source: str = ""
+    seed: int
+    episode: int
+    episode_return: float
+    success: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Summary:
+    """All episodes of one task, policy and source of ``task_latent``.
+
+    Args:
+        task: One of :data:`torchrl_bmrl.names.TASKS`.
+        policy: One of :data:`POLICIES`.
+        latent_source: Empty but for the distilled policy.
+        episodes: Number of episodes, over all seeds.
+        seeds: Number of different seeds.
+        mean_return: Mean return over the episodes.
+        std_return: Standard deviation over the episodes (n - 1 in the denominator; 0 for one).
+        return_interval: 95% bootstrap interval of the mean return, stratified by seed.
+        success_rate: Share of successful episodes, in [0, 1].
+        success_interval: 95% bootstrap interval of the success rate, stratified by seed.
+    """
+
+    task: str
+    policy: str
+    latent_source: str
+    episodes: int
+    seeds: int
+    mean_return: float
+    std_return: float
+    return_interval: tuple[float, float]
+    success_rate: float
+    success_interval: tuple[float, float]
+
+
+def read_results(path: str | os.PathLike[str]) -> list[ResultRow]:
+    """Reads a ``results.csv``; columns beyond :data:`RESULT_FIELDS` are ignored.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The rows in the file's order.
+
+    Raises:
+        DataError: if the file or a column is missing, or a value is not valid; the message names
+            the file, line, column, value and what is valid.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "results.csv"
+        >>> row = ResultRow(
+        ...     task="reach", policy="bcq", seed=0, episode=3, episode_return=151.16, success=True
+        ... )
+        >>> write_results(path, [row])
+        >>> read_results(path) == [row]
+        True
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DataError(path, None, f"no such file; expected a CSV with {_listed()}")
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        for field in RESULT_FIELDS:
+            if field not in (reader.fieldnames or ()):
+                raise DataError(path, field, f"column is missing; expected the columns {_listed()}")
+        return [_parse(record, path=path, line=reader.line_num) for record in reader]
+
+
+def write_results(path: str | os.PathLike[str], rows: Iterable[ResultRow]) -> None:
+    """Writes a ``results.csv`` atomically; reading it gives the same rows, returns bit by bit.
+
+    Args:
+        path: The file to write or replace.
+        rows: The episodes.
+
+    Raises:
+        DataError: if :func:`read_results` would refuse a row; the old file then stays.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "results.csv"
+        >>> write_results(path, [])
+        >>> path.read_text().strip()
+        'task,policy,latent_source,seed,episode,return,success'
+    """
+    path = Path(path)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, RESULT_FIELDS, lineterminator="\n")
+    writer.writeheader()
+    for line, row in enumerate(rows, start=2):
+        record = {
+            "task": row.task,
+            "policy": row.policy,
+            "latent_source": row.latent_source,
+            "seed": str(int(row.seed)),
+            "episode": str(int(row.episode)),
+            # repr of a Python float is the shortest text that reads back as the same float.
+            "return": repr(float(row.episode_return)),
+            "success": str(int(row.success)),
+        }
+        _parse(record, path=path, line=line)
+        writer.writerow(record)
+    write_atomic(path, text.getvalue())
+
+
+def summarise(rows: Iterable[ResultRow]) -> list[Summary]:
+    """One summary per task, policy and source of ``task_latent``.
+
+    Args:
+        rows: Episodes in any order; the order does not change a number.
+
+    Returns:
+        Summaries in the order of :data:`torchrl_bmrl.names.TASKS`, then :data:`POLICIES`, then
+        sources by name.
+
+    Example:
+        >>> rows = [
+        ...     ResultRow(
+        ...         task="lift", policy="bcq", seed=0, episode=i, episode_return=i, success=i > 0
+        ...     )
+        ...     for i in range(4)
+        ... ]
+        >>> summary = summarise(rows)[0]
+        >>> summary.mean_return, summary.success_rate, summary.episodes
+        (1.5, 0.75, 4)
+    """
+    groups: dict[tuple[str, str, str], list[ResultRow]] = {}
+    for row in rows:
+        groups.setdefault((row.task, row.policy, row.latent_source), []).append(row)
+    order = sorted(groups, key=lambda key: (TASKS.index(key[0]), POLICIES.index(key[1]), key[2]))
+    return [_summary(key, groups[key]) for key in order]
+
+
+def _summary(key: tuple[str, str, str], rows: list[ResultRow]) -> Summary:
+    # Resampling picks by position, so a fixed order makes the intervals independent of the file's.
+    rows = sorted(rows, key=lambda row: (row.seed, row.episode, row.episode_return, row.success))
+    seeds = [row.seed for row in rows]
+    returns = np.array([row.episode_return for row in rows], dtype=np.float64)
+    successes = np.array([row.success for row in rows], dtype=np.float64)
+    return Summary(
+        task=key[0],
+        policy=key[1],
+        latent_source=key[2],
+        episodes=len(rows),
+        seeds=len(set(seeds)),
+        mean_return=float(returns.mean()),
+        std_return=float(returns.std(ddof=1)) if len(rows) > 1 else 0.0,
+        return_interval=bootstrap_interval(returns, strata=seeds),
+        success_rate=float(successes.mean()),
+        success_interval=bootstrap_interval(successes, strata=seeds),
+    )
+
+
+def _parse(record: Mapping[str, str | None], *, path: Path, line: int) -> ResultRow:
+    """The row that a record of strings spells, or an error that names file, line and column."""
+
+    def value(field: str, *valid: str) -> str:
+        text = record[field]
+        if text is None or (valid and text not in valid):
+            raise wrong(field, text, f"one of {', '.join(valid)}" if valid else "a value")
+        return text
+
+    def wrong(field: str, text: str | None, expected: str) -> DataError:
+        found = "is missing" if text is None else f"is {text!r}"
+        return DataError(path, field, f"value in line {line} {found}; expected {expected}")
+
+    def whole(field: str) -> int:
+        try:
+            return int(value(field))
+        except ValueError:
+            raise wrong(field, record[field], "a whole number") from None
+
+    task = value("task", *TASKS)
+    policy = value("policy", *POLICIES)
+    source = value("latent_source")
+    if (policy == "distilled") != bool(source):
+        expected = "a source's name" if policy == "distilled" else "nothing"
+        raise wrong("latent_source", source, f"{expected} for policy {policy}")
+    try:
+        episode_return = float(value("return"))
+    except ValueError:
+        episode_return = math.nan
+    if not math.isfinite(episode_return):
+        raise wrong("return", record["return"], "a finite number")
+    return ResultRow(
+        task=task,
+        policy=policy,
+        latent_source=source,
+        seed=whole("seed"),
+        episode=whole("episode"),
+        episode_return=episode_return,
+        success=value("success", "0", "1") == "1",
+    )
+
+
+def _listed() -> str:
+    return ", ".join(RESULT_FIELDS)

@@ -1,0 +1,187 @@
+"""Scripted experts: proportional controllers that see the simulator's state.
+
+Each expert is a short list of named phases. Everything that decides an action, but for the phase,
+can be read off the policy's observation, so that the demonstrations can be learned from it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from torchrl_bmrl.names import PUSH_DIRECTIONS, check_task
+
+if TYPE_CHECKING:
+    from torchrl_bmrl.envs.tasks import _BMRLSawyerTask
+
+POSITION_SCALE = 0.05
+"""Metres that an action of 1 asks for."""
+ROTATION_SCALE = 0.5
+"""Radians that an action of 1 asks for."""
+OPEN, CLOSE = -1.0, 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExpertGains:
+    """Gains and limits of the scripted experts.
+
+    Attributes:
+        position: share of the position error asked for in one action.
+        rotation: share of the rotation error asked for in one action.
+        speed_limit: largest position action of an expert in free motion, in (0, 1].
+        push_speed_limit: largest position action while pushing, in (0, 1].
+        grasp_steps: steps given to the gripper to close; it needs 10 from fully open.
+        lift_height: height above its start that the cube is lifted to [m].
+        push_line: distance from the table's centre along the direction to which the cube is
+            pushed [m]. A line and not a distance from the cube's start, which no policy sees.
+    """
+
+    position: float = 4.0
+    rotation: float = 1.0
+    speed_limit: float = 1.0
+    push_speed_limit: float = 0.7
+    grasp_steps: int = 10
+    lift_height: float = 0.10
+    push_line: float = 0.20
+
+
+class Expert:
+    """A scripted controller for one running robosuite environment.
+
+    Subclasses define :attr:`phases` and :meth:`_target`.
+
+    Args:
+        env: the robosuite environment to control.
+        gains: gains and limits.
+    """
+
+    phases: ClassVar[tuple[str, ...]]
+
+    def __init__(self, env: _BMRLSawyerTask, gains: ExpertGains) -> None:
+        self.env = env
+        self.gains = gains
+        self.reset()
+
+    def reset(self) -> None:
+        """Starts over; call after every reset of the environment."""
+        self.phase = 0
+        self._rotation = self.env.eef_rotation
+
+    def _target(self) -> tuple[np.ndarray, float, float]:
+        """Advances the phase; returns target position (3,) [m], gripper command, speed limit."""
+        raise NotImplementedError
+
+    def __call__(self) -> np.ndarray:
+        """Noise-free action (7,) in [-1, 1] for the environment's present state."""
+        target, gripper, limit = self._target()
+        delta = self.gains.position * (target - self.env.eef_position) / POSITION_SCALE
+        current = self.env.eef_rotation
+        error = 0.5 * np.cross(current, self._rotation, axis=0).sum(axis=1)
+        turn = self.gains.rotation * error / ROTATION_SCALE
+        return np.concatenate([np.clip(delta, -limit, limit), np.clip(turn, -1, 1), [gripper]])
+
+
+class ReachExpert(Expert):
+    """Straight to the goal, gripper open."""
+
+    phases = ("reach",)
+
+    def _target(self) -> tuple[np.ndarray, float, float]:
+        return self.env.goal, OPEN, self.gains.speed_limit
+
+
+class LiftExpert(Expert):
+    """Descend onto the cube, grasp it, lift it."""
+
+    phases = ("descend", "grasp", "lift")
+
+    def reset(self) -> None:
+        super().reset()
+        self._closing = 0
+
+    def _target(self) -> tuple[np.ndarray, float, float]:
+        cube, limit = self.env.goal, self.gains.speed_limit
+        if self.phase == 0:
+            offset = self.env.eef_position - cube
+            if np.linalg.norm(offset[:2]) < 0.015 and abs(offset[2]) < 0.01:
+                self.phase = 1
+            # Only above the cube is it safe to go down.
+            elif np.linalg.norm(offset[:2]) > 0.03:
+                cube = cube + np.array([0.0, 0.0, max(offset[2], 0.05)])
+            return cube, OPEN, limit
+        if self.phase == 1:
+            self._closing += 1
+            if self._closing > self.gains.grasp_steps:
+                self.phase = 2
+            return cube, CLOSE, limit
+        top = cube.copy()
+        top[2] = self.env.cube_start[2] + self.gains.lift_height
+        if not self.env.grasped and cube[2] < self.env.cube_start[2] + 0.01:
+            self.reset()  # dropped or missed
+            return cube + np.array([0.0, 0.0, 0.05]), OPEN, limit
+        return top, CLOSE, limit
+
+
+class PushExpert(Expert):
+    """Go beside the cube with the gripper closed, come down, push it over the line.
+
+    Args:
+        env: the robosuite environment to control.
+        gains: gains and limits.
+        direction: unit vector to push along, (3,).
+    """
+
+    phases = ("approach", "contact", "push")
+    stand_off: ClassVar[float] = 0.055
+    """Distance behind the cube's centre at which the gripper comes down [m]."""
+
+    def __init__(
+        self, env: _BMRLSawyerTask, gains: ExpertGains, direction: tuple[float, float, float]
+    ) -> None:
+        self._direction = np.array(direction)
+        super().__init__(env, gains)
+
+    def _target(self) -> tuple[np.ndarray, float, float]:
+        cube, eef, along = self.env.goal, self.env.eef_position, self._direction
+        behind = cube - self.stand_off * along
+        offset = eef - behind
+        height, horizontal = offset[2], np.linalg.norm(offset[:2])
+        sideways = np.linalg.norm(offset[:2] - (offset @ along) * along[:2])
+        if self.phase == 2 and (sideways > 0.045 or height > 0.05):
+            self.phase = 0  # the cube slipped away
+        if self.phase == 0 and horizontal < 0.02:
+            self.phase = 1
+        if self.phase == 1 and horizontal > 0.04:
+            self.phase = 0
+        # Off centre the push turns the cube, and it slips away sideways.
+        if self.phase == 1 and height < 0.012 and sideways < 0.008:
+            self.phase = 2
+        if self.phase == 0:
+            # Rise first, so as not to knock the cube on the way to its other side.
+            clear = behind + np.array([0.0, 0.0, 0.08])
+            target = clear if height > 0.045 or horizontal < 0.03 else eef + [0.0, 0.0, 0.05]
+            return target, CLOSE, self.gains.speed_limit
+        if self.phase == 1:
+            return behind, CLOSE, self.gains.speed_limit
+        # The target is ahead of the cube until it is over the line; from there on, or off centre,
+        # it is clear of the cube, where friction does not drag it along sideways.
+        pushing = cube @ along < self.gains.push_line and sideways < 0.012
+        ahead = 0.05 if pushing else -self.stand_off
+        return cube + ahead * along, CLOSE, self.gains.push_speed_limit
+
+
+def make_expert(task: str, env: _BMRLSawyerTask, gains: ExpertGains | None = None) -> Expert:
+    """Scripted expert for a task's robosuite environment.
+
+    Raises:
+        UnknownNameError: for a name that is not a task.
+    """
+    gains = gains or ExpertGains()
+    check_task(task)
+    if task == "reach":
+        return ReachExpert(env, gains)
+    if task == "lift":
+        return LiftExpert(env, gains)
+    return PushExpert(env, gains, PUSH_DIRECTIONS[task.removeprefix("push_")])

@@ -1,0 +1,64 @@
+"""Writing files so that nobody ever sees half of one."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yields a temporary path that becomes ``path`` when the block succeeds.
+
+    The temporary file lies in the same folder (created if missing), so that the final rename is
+    atomic; its name starts with a dot and ends in ``.tmp``, so that no pattern for finished files
+    (``*.hdf5``) matches what a killed process may leave. If the block raises, the temporary file is
+    removed and whatever was at ``path`` stays.
+
+    Args:
+        path: The file to write or replace.
+
+    Yields:
+        Path to write to; the block must create the file and close it.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> with atomic_path(folder / "numbers.txt") as temporary:
+        ...     _ = temporary.write_text("1 2 3")
+        >>> [file.name for file in folder.iterdir()]
+        ['numbers.txt']
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
+    try:
+        yield temporary
+        with temporary.open("r+b") as file:
+            # Without it a power cut after the rename may leave an empty file under the final name.
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:  # an interrupt must not leave the temporary file either
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def write_atomic(path: str | os.PathLike[str], data: str | bytes) -> None:
+    r"""Writes a whole file, or leaves the old one.
+
+    Args:
+        path: The file to write or replace; its folder is created if missing.
+        data: The content; text is written as UTF-8, line ends as they are.
+
+    Example:
+        >>> import tempfile
+        >>> file = Path(tempfile.mkdtemp()) / "note.txt"
+        >>> write_atomic(file, "good\n")
+        >>> file.read_bytes()
+        b'good\n'
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)

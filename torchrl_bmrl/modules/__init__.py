@@ -1,0 +1,31 @@
+"""Networks, the acting policy, and the task embedding."""
+
+from torchrl_bmrl.modules.generator import (
+    ActionVAE,
+    make_decoder,
+    make_perturbation_network,
+    make_qvalue_network,
+)
+from torchrl_bmrl.modules.policy import BCQPolicy
+from torchrl_bmrl.modules.task_latent import (
+    DemonstrationTaskLatent,
+    OnlineTaskLatent,
+    PrototypeTaskLatent,
+    make_task_classifier,
+    make_task_encoder,
+    prototype,
+)
+
+__all__ = [
+    "ActionVAE",
+    "BCQPolicy",
+    "DemonstrationTaskLatent",
+    "OnlineTaskLatent",
+    "PrototypeTaskLatent",
+    "make_decoder",
+    "make_perturbation_network",
+    "make_qvalue_network",
+    "make_task_classifier",
+    "make_task_encoder",
+    "prototype",
+]

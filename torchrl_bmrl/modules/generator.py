@@ -1,0 +1,194 @@
+"""The conditional variational autoencoder that proposes actions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.modules import MLP
+
+
+def make_mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> MLP:
+    """ReLU network whose inputs are concatenated along the last dimension.
+
+    Example:
+        >>> make_mlp(3, 2, (8,))(torch.zeros(5, 1), torch.zeros(5, 2)).shape
+        torch.Size([5, 2])
+    """
+    return MLP(in_features, out_features, num_cells=list(num_cells), activation_class=nn.ReLU)
+
+
+class _Posterior(nn.Module):
+    """Mean and standard deviation of the latent, log-deviation clamped as published."""
+
+    def __init__(
+        self, in_features: int, latent_dim: int, num_cells: Sequence[int]
+    ) -> None:
+        super().__init__()
+        self.network = make_mlp(in_features, 2 * latent_dim, num_cells)
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        loc, log_scale = self.network(*inputs).chunk(2, dim=-1)
+        return loc, log_scale.clamp(-4.0, 15.0).exp()
+
+
+class _BoundedDecoder(nn.Module):
+    """Network whose output is squashed into the action's bounds."""
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(
+        self,
+        in_features: int,
+        action_dim: int,
+        num_cells: Sequence[int],
+        bounds: tuple[float, float],
+    ) -> None:
+        super().__init__()
+        self.network = make_mlp(in_features, action_dim, num_cells)
+        self.register_buffer("low", torch.tensor(float(bounds[0])))
+        self.register_buffer("high", torch.tensor(float(bounds[1])))
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        unit = 0.5 * (self.network(*inputs).tanh() + 1.0)
+        return self.low + (self.high - self.low) * unit
+
+
+class ActionVAE(TensorDictModuleBase):
+    r"""Generator of actions :math:`G`: encoder :math:`q(z | s, a)` and decoder :math:`G(s, z)`.
+
+    Reference: Fujimoto et al. 2019, https://arxiv.org/abs/1812.02900, appendix A (latent of twice
+    the action's size, log-deviation clamped to [-4, 15], squashed output).
+
+    Args:
+        observation_dim: size of the observation.
+        action_dim: size of the action.
+
+    Keyword Args:
+        latent_dim: size of z. Default ``2 * action_dim``.
+        num_cells: widths of the hidden layers of both networks.
+        bounds: lower and upper bound of every action dimension.
+        observation_key: key of the observation.
+
+    ``encoder`` reads ``observation (*B, observation_dim)`` and ``action (*B, action_dim)`` and
+    writes ``action_latent_loc`` and ``action_latent_scale``, ``(*B, latent_dim)``. ``decoder`` reads
+    ``observation`` and ``action_latent`` and writes ``action``. :meth:`forward` proposes actions:
+    it draws z ~ N(0, I) where the input has none, and decodes.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> generator = ActionVAE(observation_dim=3, action_dim=2)
+        >>> proposal = generator(TensorDict({"observation": torch.zeros(5, 3)}, [5]))
+        >>> proposal["action"].shape, proposal["action_latent"].shape
+        (torch.Size([5, 2]), torch.Size([5, 4]))
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        *,
+        latent_dim: int | None = None,
+        num_cells: Sequence[int] = (256, 256),
+        bounds: tuple[float, float] = (-1.0, 1.0),
+        observation_key: NestedKey = "observation",
+    ) -> None:
+        super().__init__()
+        self.latent_dim = latent_dim or 2 * action_dim
+        self.encoder = TensorDictModule(
+            _Posterior(observation_dim + action_dim, self.latent_dim, num_cells),
+            in_keys=[observation_key, "action"],
+            out_keys=["action_latent_loc", "action_latent_scale"],
+        )
+        self.decoder = make_decoder(
+            observation_dim,
+            action_dim,
+            self.latent_dim,
+            num_cells=num_cells,
+            bounds=bounds,
+            in_keys=(observation_key, "action_latent"),
+        )
+        self.in_keys = [observation_key]
+        self.out_keys = ["action_latent", "action"]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Proposes one action per row."""
+        if "action_latent" not in tensordict.keys():
+            observation = tensordict.get(self.in_keys[0])
+            shape = (*tensordict.batch_size, self.latent_dim)
+            latent = torch.randn(shape, device=observation.device, dtype=observation.dtype)
+            tensordict.set("action_latent", latent)
+        return self.decoder(tensordict)
+
+
+def make_decoder(
+    observation_dim: int,
+    action_dim: int,
+    latent_dim: int,
+    *,
+    task_latent_dim: int = 0,
+    num_cells: Sequence[int] = (256, 256),
+    bounds: tuple[float, float] = (-1.0, 1.0),
+    in_keys: Sequence[NestedKey] | None = None,
+) -> TensorDictModule:
+    """Decoder from observation, ``action_latent`` and, with ``task_latent_dim``, ``task_latent``.
+
+    The student of the distillation is such a decoder alone: it needs no encoder.
+
+    Example:
+        >>> make_decoder(3, 2, 4, task_latent_dim=2).in_keys
+        ['observation', 'action_latent', 'task_latent']
+    """
+    if in_keys is None:
+        in_keys = ["observation", "action_latent", *(["task_latent"] if task_latent_dim else [])]
+    network = _BoundedDecoder(
+        observation_dim + latent_dim + task_latent_dim, action_dim, num_cells, bounds
+    )
+    return TensorDictModule(network, in_keys=list(in_keys), out_keys=["action"])
+
+
+def make_qvalue_network(
+    observation_dim: int,
+    action_dim: int,
+    *,
+    task_latent_dim: int = 0,
+    num_cells: Sequence[int] = (256, 256),
+) -> TensorDictModule:
+    """Critic from observation, action and, with ``task_latent_dim``, ``task_latent``.
+
+    Writes ``state_action_value (*B, 1)``.
+
+    Example:
+        >>> make_qvalue_network(3, 2).in_keys
+        ['observation', 'action']
+    """
+    in_keys = ["observation", "action", *(["task_latent"] if task_latent_dim else [])]
+    network = make_mlp(observation_dim + action_dim + task_latent_dim, 1, num_cells)
+    return TensorDictModule(network, in_keys=in_keys, out_keys=["state_action_value"])
+
+
+class _Tanh(nn.Module):
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        return self.network(*inputs).tanh()
+
+
+def make_perturbation_network(
+    observation_dim: int, action_dim: int, *, num_cells: Sequence[int] = (256, 256)
+) -> TensorDictModule:
+    """Perturbation network: observation and action to ``perturbation (*B, action_dim)`` in [-1, 1].
+
+    Example:
+        >>> make_perturbation_network(3, 2).out_keys
+        ['perturbation']
+    """
+    network = _Tanh(make_mlp(observation_dim + action_dim, action_dim, num_cells))
+    return TensorDictModule(network, in_keys=["observation", "action"], out_keys=["perturbation"])

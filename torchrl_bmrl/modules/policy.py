@@ -1,0 +1,133 @@
+"""Acting with a generator and a critic."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+
+from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.objectives.functional import perturbed_action, sample_action_latent
+
+if TYPE_CHECKING:
+    from torchrl.objectives import LossModule
+
+
+class BCQPolicy(TensorDictModuleBase):
+    r"""The best of many proposed actions.
+
+    .. math:: \pi(s) = a_{i^*},\quad i^* = \arg\max_i Q_1(s, a_i),\quad
+              a_i = G(s, z_i) + \phi\,\xi(s, G(s, z_i))
+
+    Reference: *Compositional Skill Learning Using Batch Meta RL*, eq. 2, section 7.1.
+
+    It serves stage 1 and stage 2 alike: where the decoder and the critic read ``task_latent``, so
+    does the policy. Proposals are drawn from PyTorch's global generator at every call, whatever the
+    exploration type.
+
+    Args:
+        decoder: (observation, ``action_latent``[, ``task_latent``]) → ``action``.
+        qvalue_network: (observation, ``action``[, ``task_latent``]) → ``state_action_value``.
+        perturbation_network: optional (observation, ``action``) → ``perturbation``.
+
+    Keyword Args:
+        latent_dim: size of ``action_latent``.
+        num_candidates: proposals per state. Default 100.
+        latent_clip: bound on the latent, ``None`` for none. Default 0.5.
+        max_perturbation: φ.
+        bounds: of the action, used with a perturbation network.
+
+    Keys read: ``observation (*B, obs_dim)`` (and ``task_latent (*B, m)``). Key written:
+    ``action (*B, action_dim)``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
+        >>> generator, critic = ActionVAE(3, 2), make_qvalue_network(3, 2)
+        >>> policy = BCQPolicy(generator.decoder, critic, latent_dim=generator.latent_dim)
+        >>> policy(TensorDict({"observation": torch.zeros(5, 3)}, [5]))["action"].shape
+        torch.Size([5, 2])
+    """
+
+    def __init__(
+        self,
+        decoder: TensorDictModule,
+        qvalue_network: TensorDictModule,
+        perturbation_network: TensorDictModule | None = None,
+        *,
+        latent_dim: int,
+        num_candidates: int = 100,
+        latent_clip: float | None = 0.5,
+        max_perturbation: float = 0.05,
+        bounds: tuple[float, float] = (-1.0, 1.0),
+    ) -> None:
+        super().__init__()
+        if num_candidates < 1:
+            raise BMRLError(f"num_candidates is {num_candidates}; valid: at least 1")
+        self.decoder = decoder
+        self.qvalue_network = qvalue_network
+        self.perturbation_network = perturbation_network
+        self.latent_dim = latent_dim
+        self.num_candidates = num_candidates
+        self.latent_clip = latent_clip
+        self.max_perturbation = max_perturbation
+        self.bounds = bounds
+        self.in_keys = [key for key in decoder.in_keys if key != "action_latent"]
+        self.out_keys = ["action"]
+
+    @classmethod
+    def from_loss(cls, loss: LossModule, *, num_candidates: int = 100) -> BCQPolicy:
+        """Policy of a trained :class:`~torchrl_bmrl.objectives.BCQLoss`, as a copy.
+
+        Later updates of the loss do not reach the policy.
+        """
+        generator = _instantiate(loss.generator, loss.generator_params)
+        critic = _instantiate(loss.qvalue_network, loss.qvalue_network_params[0])
+        perturbation = loss.perturbation_network
+        if perturbation is not None:
+            perturbation = _instantiate(perturbation, loss.perturbation_network_params)
+        return cls(
+            generator.decoder,
+            critic,
+            perturbation,
+            latent_dim=generator.latent_dim,
+            num_candidates=num_candidates,
+            latent_clip=None if loss.latent_clip is None else float(loss.latent_clip),
+            max_perturbation=float(loss.max_perturbation),
+            bounds=(loss.action_low, loss.action_high),
+        )
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes ``action``."""
+        proposals = tensordict.select(*self.in_keys).unsqueeze(-1)
+        proposals = proposals.expand(*tensordict.batch_size, self.num_candidates)
+        observation = proposals.get(self.in_keys[0])
+        latent = sample_action_latent(
+            (*proposals.batch_size, self.latent_dim),
+            latent_clip=self.latent_clip,
+            device=observation.device,
+            dtype=observation.dtype,
+        )
+        proposals = self.decoder(proposals.copy().set("action_latent", latent))
+        if self.perturbation_network is not None:
+            proposals = self.perturbation_network(proposals)
+            action, perturbation = proposals.get("action"), proposals.get("perturbation")
+            proposals.set(
+                "action", perturbed_action(action, perturbation, self.max_perturbation, *self.bounds)
+            )
+        value = self.qvalue_network(proposals).get("state_action_value")
+        best = value.argmax(dim=-2, keepdim=True)
+        action = proposals.get("action")
+        best = best.expand(*best.shape[:-1], action.shape[-1])
+        return tensordict.set("action", action.gather(-2, best).squeeze(-2))
+
+
+def _instantiate(module: TensorDictModule, params: TensorDictBase) -> TensorDictModule:
+    """A stand-alone copy of a functional module that holds the given parameters."""
+    module = deepcopy(module)
+    params.data.clone().to_module(module, preserve_module_state=False)
+    return module.requires_grad_(False)

@@ -1,0 +1,158 @@
+r"""The equations of the losses: one function each, on plain tensors.
+
+Leading dimensions are written ``*B``. Every function is differentiable in its tensor arguments.
+
+References:
+    BCQ: Fujimoto et al., *Off-Policy Deep Reinforcement Learning without Exploration*, ICML 2019,
+    https://arxiv.org/abs/1812.02900.
+    Meta-distillation: *Compositional Skill Learning Using Batch Meta RL*, section 6.2.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812
+
+
+def gaussian_kl(loc: Tensor, scale: Tensor) -> Tensor:
+    r"""Kullback-Leibler divergence from a diagonal Gaussian to the standard one, per dimension.
+
+    .. math:: \mathrm{KL} = \tfrac12 (\mu^2 + \sigma^2 - 1) - \log\sigma
+
+    Args:
+        loc: mean, ``(*B, latent_dim)``.
+        scale: standard deviation, ``(*B, latent_dim)``, positive.
+
+    Returns:
+        ``(*B, latent_dim)``; the caller sums or averages over the last dimension.
+
+    Example:
+        >>> gaussian_kl(torch.zeros(2), torch.ones(2))
+        tensor([0., 0.])
+    """
+    return 0.5 * (loc.square() + scale.square() - 1.0) - scale.log()
+
+
+def sample_action_latent(
+    shape: torch.Size | tuple[int, ...],
+    *,
+    latent_clip: float | Tensor | None,
+    device: torch.device | str | None = None,
+    dtype: torch.dtype | None = None,
+) -> Tensor:
+    r"""Draws the VAE's latent for action proposals, z ~ N(0, I) clipped to ±``latent_clip``.
+
+    The draw is explicit because inside a TorchRL loss a probabilistic module returns its mean, and
+    all proposals would be the same.
+
+    Args:
+        shape: shape of the sample, ``(*B, latent_dim)``.
+        latent_clip: bound c; ``None`` for no bound.
+        device: of the sample.
+        dtype: of the sample.
+
+    Example:
+        >>> z = sample_action_latent((1000, 14), latent_clip=0.5)
+        >>> z.abs().max().item() <= 0.5, z.std().item() > 0.3
+        (True, True)
+    """
+    latent = torch.randn(shape, device=device, dtype=dtype)
+    return latent if latent_clip is None else latent.clamp(-latent_clip, latent_clip)
+
+
+def perturbed_action(
+    action: Tensor, perturbation: Tensor, max_perturbation: float | Tensor, low: Tensor, high: Tensor
+) -> Tensor:
+    r"""Action moved by the perturbation network within the action's bounds.
+
+    .. math:: a' = \mathrm{clip}(a + \phi\, \xi(s, a),\ a_{low},\ a_{high})
+
+    Args:
+        action: a, ``(*B, action_dim)``.
+        perturbation: ξ in [-1, 1], ``(*B, action_dim)``.
+        max_perturbation: φ.
+        low: lower bound, broadcast against ``action``.
+        high: upper bound.
+
+    Example:
+        >>> low, high = torch.tensor(-1.0), torch.tensor(1.0)
+        >>> perturbed_action(torch.tensor([0.98]), torch.tensor([1.0]), 0.05, low, high)
+        tensor([1.])
+    """
+    return torch.clamp(action + max_perturbation * perturbation, low, high)
+
+
+def soft_clipped_value(state_action_value: Tensor, lmbda: float | Tensor) -> Tensor:
+    r"""Soft clipped double-Q: between the ensemble's minimum and maximum.
+
+    .. math:: \lambda \min_j Q_j + (1 - \lambda) \max_j Q_j
+
+    Args:
+        state_action_value: Q of each critic, ``(num_qvalue_nets, *B)``.
+        lmbda: λ in [0, 1].
+
+    Returns:
+        ``(*B,)``.
+
+    Example:
+        >>> soft_clipped_value(torch.tensor([[1.0], [3.0]]), 0.75)
+        tensor([1.5000])
+    """
+    return lmbda * state_action_value.amin(0) + (1.0 - lmbda) * state_action_value.amax(0)
+
+
+def bcq_next_value(state_action_value: Tensor, lmbda: float | Tensor) -> Tensor:
+    r"""BCQ's value of a next state: the best candidate under the soft clipped double-Q.
+
+    .. math:: V(s') = \max_i \left[\lambda \min_j Q_j(s', a_i) + (1-\lambda) \max_j Q_j(s', a_i)\right]
+
+    Reference: BCQ, eq. 13; this project's paper, eqs. 1-2.
+
+    Args:
+        state_action_value: ``(num_qvalue_nets, *B, num_candidates)``.
+        lmbda: λ in [0, 1].
+
+    Returns:
+        ``(*B,)``. The maximum comes after the mix over critics.
+
+    Example:
+        >>> q = torch.tensor([[[1.0, 2.0]], [[3.0, 2.5]]])  # two critics, one state, two candidates
+        >>> bcq_next_value(q, 1.0)
+        tensor([2.])
+    """
+    return soft_clipped_value(state_action_value, lmbda).amax(-1)
+
+
+def squared_error(prediction: Tensor, target: Tensor) -> Tensor:
+    r"""Squared Euclidean distance, :math:`\lVert \hat g - g \rVert_2^2`.
+
+    Args:
+        prediction: ``(*B, n)``.
+        target: ``(*B, n)``.
+
+    Returns:
+        ``(*B,)``.
+
+    Example:
+        >>> squared_error(torch.tensor([1.0, 2.0]), torch.zeros(2))
+        tensor(5.)
+    """
+    return (prediction - target).square().sum(-1)
+
+
+def direction_error(prediction: Tensor, target: Tensor) -> Tensor:
+    r"""One minus the cosine of the angle, :math:`1 - \hat g \cdot g / (\lVert\hat g\rVert \lVert g\rVert)`.
+
+    Args:
+        prediction: ``(*B, n)``.
+        target: ``(*B, n)``.
+
+    Returns:
+        ``(*B,)`` in [0, 2].
+
+    Example:
+        >>> direction_error(torch.tensor([2.0, 0.0]), torch.tensor([0.0, 1.0]))
+        tensor(1.)
+    """
+    return 1.0 - F.cosine_similarity(prediction, target, dim=-1)

@@ -1,0 +1,304 @@
+"""The report of a run folder: tables, figures and one page, all from files of results."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_bmrl.errors import BMRLError, DataError
+from torchrl_bmrl.evaluation.results import Summary, read_results, summarise
+from torchrl_bmrl.files import write_atomic
+from torchrl_bmrl.names import TASKS
+from torchrl_bmrl.reports import paper
+from torchrl_bmrl.reports.figures import (
+    Curve,
+    embedding_scatter,
+    embedding_tsne,
+    reach_trajectories,
+    stage1_curves,
+)
+from torchrl_bmrl.reports.page import Picture, Section, write_page
+from torchrl_bmrl.reports.tables import results_table, table_1, table_2, task_name
+
+_CURVE_FIELDS = ("epoch", "update", "return")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Embeddings:
+    """Embedded transitions, row by row.
+
+    Args:
+        task_latent: Embeddings m, shape ``(N, d)``.
+        task: Class index, shape ``(N,)``.
+        episode: Episode within its task, shape ``(N,)``.
+        step: Step within its episode, shape ``(N,)``.
+        distance: End effector to goal, shape ``(N,)``, [m].
+
+    Raises:
+        BMRLError: if the shapes do not fit, or an embedding or a distance is not finite.
+
+    Example:
+        >>> zeros = np.zeros(3, dtype=int)
+        >>> Embeddings(
+        ...     task_latent=np.zeros((3, 2)), task=zeros, episode=zeros, step=zeros, distance=zeros
+        ... ).task_latent.shape
+        (3, 2)
+    """
+
+    task_latent: NDArray[Any]
+    task: NDArray[np.integer[Any]]
+    episode: NDArray[np.integer[Any]]
+    step: NDArray[np.integer[Any]]
+    distance: NDArray[np.floating[Any]]
+
+    def __post_init__(self) -> None:
+        if self.task_latent.ndim != 2 or self.task_latent.shape[1] == 0:
+            raise BMRLError(f"task_latent must have shape (N, d), got {self.task_latent.shape}")
+        expected = (len(self.task_latent),)
+        for name in ("task", "episode", "step", "distance"):
+            if (shape := getattr(self, name).shape) != expected:
+                raise BMRLError(f"{name} must have shape {expected}, got {shape}")
+        for name in ("task_latent", "distance"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise BMRLError(f"{name} must be finite; it holds NaN or infinite values")
+
+
+def read_stage1_curves(run_dir: Path) -> dict[str, Curve]:
+    """Reads ``bcq/<task>/evaluations.csv`` of a run folder, for those tasks that have one.
+
+    Args:
+        run_dir: The run folder.
+
+    Returns:
+        Evaluations by task: epoch, update and returns, in the order of the epochs.
+
+    Raises:
+        DataError: if a file lacks a column, or a value is not a finite number.
+
+    Example:
+        >>> read_stage1_curves(Path("no-such-run"))
+        {}
+    """
+    files = {task: run_dir / "bcq" / task / "evaluations.csv" for task in TASKS}
+    curves = {task: _read_curve(path) for task, path in files.items() if path.is_file()}
+    return {task: curve for task, curve in curves.items() if curve}
+
+
+def write_report(
+    run_dir: Path,
+    *,
+    default_source: str,
+    facts: Mapping[str, str],
+    embeddings: Embeddings | None = None,
+    accuracy: float | None = None,
+    seed: int = 0,
+) -> Path:
+    """Writes tables, figures and ``report.html`` of a run folder from its ``results.csv``.
+
+    Written are ``tables/{results,table1,table2}.{md,csv}``, ``figures/*.png`` and ``report.html``,
+    each atomically and after everything has been computed. A figure without data is left out, and
+    the page says so.
+
+    Args:
+        run_dir: The run folder, with ``results.csv`` and, for the training curves,
+            ``bcq/<task>/evaluations.csv`` (columns epoch, update, episode, return, success).
+        default_source: Source of m that comes first in the tables.
+        facts: Names and values for the box at the top of the page.
+        embeddings: Transitions to draw, from held-out data.
+        accuracy: Held-out classification accuracy of the embedding, in [0, 1].
+        seed: Seed of t-SNE.
+
+    Returns:
+        Path of the page.
+
+    Raises:
+        DataError: if ``results.csv`` or a file of training curves is missing or not valid.
+    """
+    run_dir = Path(run_dir)
+    summaries = summarise(read_results(run_dir / "results.csv"))
+    if not summaries:
+        raise DataError(run_dir / "results.csv", None, "holds no episode to report on")
+    curves = read_stage1_curves(run_dir)
+    tables = {
+        "results": results_table(summaries),
+        "table1": table_1(summaries, epochs={task: curve[-1][0] for task, curve in curves.items()}),
+        "table2": table_2(summaries, default_source=default_source),
+    }
+    stage1, note1 = _draw_stage1(curves, summaries)
+    stage2, note2 = _draw_embeddings(embeddings, seed=seed)
+
+    for name, table in tables.items():
+        write_atomic(run_dir / "tables" / f"{name}.md", table.markdown())
+        write_atomic(run_dir / "tables" / f"{name}.csv", table.csv())
+    for name, picture in {**stage1, **stage2}.items():
+        write_atomic(run_dir / "figures" / f"{name}.png", picture.png)
+    page = run_dir / "report.html"
+    write_page(
+        page,
+        title="Compositional skill learning with batch meta RL",
+        facts=facts,
+        sections=[
+            Section(
+                heading="Summary",
+                paragraphs=_headline(summaries, default_source=default_source, accuracy=accuracy),
+            ),
+            Section(
+                heading="Stage 1: one BCQ policy per task",
+                paragraphs=note1,
+                tables=[tables["table1"]],
+                pictures=list(stage1.values()),
+            ),
+            Section(
+                heading="Stage 2: one distilled policy for all tasks", tables=[tables["table2"]]
+            ),
+            Section(heading="The task embedding", paragraphs=note2, pictures=list(stage2.values())),
+            Section(heading="Everything measured", tables=[tables["results"]]),
+        ],
+    )
+    return page
+
+
+def _headline(
+    summaries: Sequence[Summary], *, default_source: str, accuracy: float | None
+) -> list[str]:
+    """The few sentences that a hurried reader needs."""
+    sentences = []
+    bcq = {s.task: s for s in summaries if s.policy == "bcq"}
+    if bcq:
+        sentences.append(f"The BCQ policies, one per task, {_successes(list(bcq.values()))}.")
+    distilled = [
+        s for s in summaries if s.policy == "distilled" and s.latent_source == default_source
+    ]
+    if distilled:
+        sentences.append(
+            f"The distilled policy, one for all tasks, its task embedding m from the "
+            f"source “{default_source}”, "
+            f"{_successes(distilled)}."
+        )
+    shares = [
+        (s.mean_return / bcq[s.task].mean_return, s.task)
+        for s in distilled
+        if s.task in bcq and bcq[s.task].mean_return > 0.0
+    ]
+    if shares:
+        low, high = min(shares), max(shares)
+        sentences.append(
+            f"Its return is between {low[0]:.1%} ({task_name(low[1])}) and {high[0]:.1%} "
+            f"({task_name(high[1])}) of that of the BCQ policies."
+        )
+    if accuracy is not None:
+        sentences.append(
+            f"A single linear layer tells a held-out transition's task from its embedding in "
+            f"{accuracy:.1%} of the cases (paper: {paper.ACCURACY:.0%})."
+        )
+    return [" ".join(sentences)] if sentences else []
+
+
+def _successes(summaries: Sequence[Summary]) -> str:
+    """How often the policies of some tasks succeeded, and where least."""
+    episodes = sum(s.episodes for s in summaries)
+    successes = round(sum(s.success_rate * s.episodes for s in summaries))
+    worst = min(summaries, key=lambda s: s.success_rate)
+    return (
+        f"solved {successes} of {episodes} episodes (least often on {task_name(worst.task)}: "
+        f"{worst.success_rate:.0%})"
+    )
+
+
+def _draw_stage1(
+    curves: Mapping[str, Curve], summaries: Sequence[Summary]
+) -> tuple[dict[str, Picture], list[str]]:
+    """The picture of stage 1, and a sentence on what is missing from it."""
+    missing = [task_name(task) for task in TASKS if task not in curves]
+    note = [f"No training curve was found for {', '.join(missing)}."] if missing else []
+    if not curves:
+        return {}, ["The figure of training curves is left out: no evaluations were found."]
+    experts = {s.task: s.mean_return for s in summaries if s.policy == "expert"}
+    return {
+        "stage1_curves": Picture(
+            png=stage1_curves(curves, expert_means=experts),
+            alt="Return against training epoch, one panel per task",
+            caption=(
+                "Return of the BCQ policy, rolled out after each training epoch: mean over the "
+                "episodes, and a band of one standard deviation to either side. Dashed: mean "
+                "return of the scripted expert whose demonstrations it learns from. Compare the "
+                "paper's figure 3 (push tasks)."
+            ),
+        )
+    }, note
+
+
+def _draw_embeddings(
+    embeddings: Embeddings | None, *, seed: int
+) -> tuple[dict[str, Picture], list[str]]:
+    """The pictures of the embedding, and a sentence on what is missing."""
+    if embeddings is None:
+        return {}, ["The figures of the embedding are left out: no embeddings were given."]
+    # In time order, whatever order the transitions came in.
+    order = np.lexsort((embeddings.step, embeddings.episode, embeddings.task))
+    latent, task = embeddings.task_latent[order], embeddings.task[order]
+    pictures = {
+        "embedding": Picture(
+            png=embedding_scatter(latent, task),
+            alt="Scatter plot of task embeddings, one colour per task",
+            caption=(
+                "Each point is the embedding m of one transition (state, action, reward, next "
+                "state). Tasks that form separate clusters can be told apart from a single "
+                "transition. Compare the paper's figure 4a."
+            ),
+        ),
+        "embedding_tsne": Picture(
+            png=embedding_tsne(latent, task, seed=seed),
+            alt="t-SNE map of task embeddings, one colour per task",
+            caption=(
+                "The same embeddings after t-SNE, which keeps neighbours together and distorts "
+                "distances: several clusters of one colour suggest stages of that task, such as "
+                "descending, grasping and lifting. Compare the paper's figure 4b."
+            ),
+        ),
+    }
+    reach = task == TASKS.index("reach")
+    if not reach.any():
+        return pictures, ["The reach trajectories are left out: no reach transition was given."]
+    pictures["reach_trajectories"] = Picture(
+        png=reach_trajectories(
+            latent[reach], embeddings.episode[order][reach], embeddings.distance[order][reach]
+        ),
+        alt="Lines through the embedding, one per reach episode, coloured by distance to the goal",
+        caption=(
+            "Reach episodes as lines through the embedding, from circle to star. If the embedding "
+            "holds the progress of the task, the lines end in one place and points of one colour "
+            "lie on a curve around it. Compare the paper's figure 5."
+        ),
+    )
+    return pictures, []
+
+
+def _read_curve(path: Path) -> Curve:
+    epochs: dict[tuple[int, int], list[float]] = {}
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        for field in _CURVE_FIELDS:
+            if field not in (reader.fieldnames or ()):
+                raise DataError(path, field, "column is missing")
+        for record in reader:
+            numbers = [_number(record[f], path, f, reader.line_num) for f in _CURVE_FIELDS]
+            epochs.setdefault((int(numbers[0]), int(numbers[1])), []).append(numbers[2])
+    return [(epoch, update, np.array(epochs[epoch, update])) for epoch, update in sorted(epochs)]
+
+
+def _number(text: str | None, path: Path, field: str, line: int) -> float:
+    try:
+        number = float(text or "")
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise DataError(path, field, f"value in line {line} is {text!r}; expected a finite number")
+    return number
