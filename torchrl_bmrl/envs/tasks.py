@@ -357,6 +357,18 @@ def make_robosuite_env(task: str, **kwargs: Any) -> _BMRLSawyerTask:
     return BMRLSawyerPush(direction=task.removeprefix("push_"), **kwargs)
 
 
+def robosuite_metadata(task: str) -> dict[str, Any]:
+    """robomimic's ``env_args``: what rebuilds the environment of a task with ``robosuite.make``."""
+    kwargs = {} if task in ("reach", "lift") else {"direction": task.removeprefix("push_")}
+    name = {"reach": "BMRLSawyerReach", "lift": "BMRLSawyerLift"}.get(task, "BMRLSawyerPush")
+    return {
+        "env_name": name,
+        "type": 1,
+        "env_version": robosuite.__version__,
+        "env_kwargs": kwargs | {"robots": "Sawyer", "control_freq": CONTROL_FREQUENCY},
+    }
+
+
 class SawyerEnv(gymnasium.Env):
     """One Sawyer task as a gymnasium environment.
 
@@ -381,7 +393,7 @@ class SawyerEnv(gymnasium.Env):
         >>> env = SawyerEnv("lift")
         >>> observation, info = env.reset(seed=0)
         >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
-        >>> terminated, info["success"]
+        >>> terminated, bool(info["success"])
         (False, False)
     """
 
@@ -414,9 +426,10 @@ class SawyerEnv(gymnasium.Env):
         )
 
     def _info(self, terms: dict[str, float]) -> dict[str, Any]:
+        # numpy scalars: TorchRL's info reader asks every value for its dtype.
         return {
-            "success": self.robosuite_env._check_success(),
-            **{f"reward_{name}": terms.get(name, 0.0) for name in REWARD_TERMS},
+            "success": np.bool_(self.robosuite_env._check_success()),
+            **{f"reward_{name}": np.float64(terms.get(name, 0.0)) for name in REWARD_TERMS},
         }
 
     def reset(
@@ -475,5 +488,5 @@ __all__ = [
     "make_robosuite_env",
     "push_velocity_reward",
     "reach_reward",
-    "robosuite",
+    "robosuite_metadata",
 ]

@@ -23,7 +23,7 @@ ROTATION_SCALE = 0.5
 OPEN, CLOSE = -1.0, 1.0
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class ExpertGains:
     """Gains and limits of the scripted experts.
 

@@ -1,0 +1,163 @@
+"""Stage 2: the agents of all tasks into one policy conditioned on a learned embedding.
+
+    python recipes/distill.py run_dir=runs/mine             # after recipes/train_bcq.py
+    python recipes/distill.py preset=literal run_dir=runs/literal
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+
+from pathlib import Path
+
+import hydra
+import torch
+from omegaconf import DictConfig
+from settings import Config, run_recipe
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_bmrl.agents import Student, load_bcq_loss
+from torchrl_bmrl.checkpoint import load_checkpoint, load_state, save_checkpoint
+from torchrl_bmrl.data import make_multi_task_replay_buffer
+from torchrl_bmrl.data.demonstrations import load_transitions, read_statistics
+from torchrl_bmrl.modules import BCQPolicy
+from torchrl_bmrl.objectives import BCQLoss, MetaDistillationLoss
+from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
+from torchrl_bmrl.runs import check_finite, log_metrics, make_logger
+
+LOSS_SETTINGS = (
+    "context",
+    "context_fraction",
+    "context_size",
+    "detach_task_latent",
+    "classification_weight",
+    "generator_weight",
+    "direction_weight",
+    "qvalue_weight",
+    "latent_norm_weight",
+)
+
+
+def load_teachers(config: Config) -> list[BCQLoss]:
+    """The trained agent of every task."""
+    folder = Path(config.run_dir) / "bcq"
+    return [load_bcq_loss(folder / task / "checkpoint.safetensors")[0] for task in config.tasks]
+
+
+def value_statistics(
+    teachers: list[BCQPolicy], datasets: list[TensorDictBase]
+) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of each teacher's value on its own data, ``(num_tasks,)``."""
+    values = [
+        teacher.qvalue_network(data.select("observation", "action")).get("state_action_value")
+        for teacher, data in zip(teachers, datasets, strict=True)
+    ]
+    return torch.stack([v.mean() for v in values]), torch.stack([v.std() for v in values])
+
+
+def train_student(config: Config, report: Report) -> None:
+    """Trains the student, or goes on from its checkpoint."""
+    settings, run_dir = config.distill, Path(config.run_dir)
+    path = run_dir / "distill" / "checkpoint.safetensors"
+    statistics = read_statistics(run_dir / "data")
+    train, valid = (
+        [
+            load_transitions(run_dir / "data", task, statistics, split=split, num_task=i)
+            for i, task in enumerate(config.tasks)
+        ]
+        for split in ("train", "valid")
+    )
+    buffer = make_multi_task_replay_buffer(train, batch_size=settings.batch_size)
+
+    torch.manual_seed(derive_seed(config.seed, "distill"))
+    losses = load_teachers(config)
+    teachers = [BCQPolicy.from_loss(loss) for loss in losses]
+    options = {
+        "num_tasks": len(config.tasks),
+        "task_latent_dim": settings.task_latent_dim,
+        "num_cells": settings.num_cells,
+        "latent_dim": teachers[0].latent_dim,
+    }
+    student = Student(**options)
+    normalisation = value_statistics(teachers, train) if settings.normalise_qvalue else (None, None)
+    loss = MetaDistillationLoss(
+        student.task_encoder,
+        student.task_classifier,
+        student.generator,
+        student.qvalue_network,
+        [teacher.decoder for teacher in teachers],
+        [teacher.qvalue_network for teacher in teachers],
+        latent_dim=teachers[0].latent_dim,
+        latent_clip=teachers[0].latent_clip,
+        qvalue_loc=normalisation[0],
+        qvalue_scale=normalisation[1],
+        **{name: getattr(settings, name) for name in LOSS_SETTINGS},
+    )
+    optimizer = torch.optim.Adam(loss.parameters(), lr=settings.lr)
+    decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.updates)
+    done = 0
+    if path.exists():
+        state, metadata = load_checkpoint(path, kind="student")
+        load_state(student, state["student"], path)
+        optimizer.load_state_dict(state["optimizer"])
+        decay.load_state_dict(state["decay"])
+        torch.set_rng_state(state["rng"])
+        done = metadata["updates"]
+        report(done)
+    logger = make_logger(config.logger, run_dir, "distill") if done < settings.updates else None
+
+    for update in range(done + 1, settings.updates + 1):
+        losses = loss(buffer.sample())
+        total = sum(term for name, term in losses.items() if name.startswith("loss_"))
+        optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        optimizer.step()
+        if settings.cosine:
+            decay.step()
+        report(1)
+        if update % config.log_interval == 0:
+            check_finite(losses, f"distillation, update {update}")
+            log_metrics(logger, losses, update)
+        if update % config.checkpoint_interval == 0 or update == settings.updates:
+            student.set_prototypes(train, settings.prototype)
+            state = {
+                "student": student.state_dict(),
+                "optimizer": optimizer.state_dict(),
+                "decay": decay.state_dict(),
+                "rng": torch.get_rng_state(),
+            }
+            metadata = {
+                "kind": "student",
+                "tasks": config.tasks,
+                "student": options,
+                "latent_clip": teachers[0].latent_clip,
+                "updates": update,
+                "accuracy": student.accuracy(torch.cat(valid)),
+                "statistics": {name: x.tolist() for name, x in vars(statistics).items()},
+            }
+            save_checkpoint(path, state, metadata)
+
+
+def distill(config: Config) -> None:
+    """Stage 2 under a progress bar."""
+    run_jobs(
+        train_student,
+        [config],
+        workers=1,
+        total=config.distill.updates,
+        description="stage 2: distilling",
+        unit="update",
+    )
+
+
+@hydra.main(version_base="1.3", config_path="config", config_name="recipe")
+def main(config: DictConfig) -> None:
+    """Command line."""
+    run_recipe(config, distill)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,175 @@
+"""Episodes from starts that no demonstration had, and the report.
+
+    python recipes/evaluate.py run_dir=runs/mine            # after recipes/distill.py
+    python recipes/evaluate.py run_dir=runs/mine "evaluate.latent_sources=[prototype,online]"
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+
+from pathlib import Path
+
+import hydra
+import numpy as np
+import torch
+from omegaconf import DictConfig
+from settings import Config, run_recipe
+
+from torchrl_bmrl.agents import load_bcq_loss, load_student
+from torchrl_bmrl.data.demonstrations import demonstration_path, load_transitions, read_statistics
+from torchrl_bmrl.data.robomimic import read_demonstrations
+from torchrl_bmrl.envs.transforms import make_env
+from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
+from torchrl_bmrl.evaluation.rollout import EpisodeOutcome, evaluate_policy
+from torchrl_bmrl.experts.collect import collect_episode
+from torchrl_bmrl.modules import BCQPolicy
+from torchrl_bmrl.names import TASKS
+from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
+from torchrl_bmrl.reports import Embeddings, write_report
+from torchrl_bmrl.runs import read_versions
+
+
+def evaluate_job(job: tuple[Config, str, str, str], report: Report) -> list[ResultRow]:
+    """All episodes of one task, policy and source of m; kept at once, read back if there."""
+    config, task, policy_name, source = job
+    run_dir, episodes = Path(config.run_dir), config.evaluate.episodes
+    path = run_dir / "evaluation" / ("-".join(filter(None, (task, policy_name, source))) + ".csv")
+    if path.exists():
+        report(episodes)
+        return read_results(path)
+    seeds = [derive_seed(config.seed, "evaluate", task, i) for i in range(episodes)]
+    statistics = read_statistics(run_dir / "data")
+    if policy_name == "expert":
+        outcomes = expert_outcomes(config, task, seeds)
+    elif policy_name == "bcq":
+        loss, _ = load_bcq_loss(run_dir / "bcq" / task / "checkpoint.safetensors")
+        policy = BCQPolicy.from_loss(loss, num_candidates=config.evaluate.num_candidates)
+        outcomes = evaluate_policy(make_env(task, statistics), policy, seeds)
+    else:
+        student, metadata = load_student(run_dir / "distill" / "checkpoint.safetensors")
+        policy = student.policy(
+            num_candidates=config.evaluate.num_candidates, latent_clip=metadata["latent_clip"]
+        )
+        index = config.tasks.index(task)
+        held_out = load_transitions(
+            run_dir / "data", task, statistics, split="valid", num_task=index
+        )
+        demonstration = held_out[held_out["episode"] == 0]
+        transform = student.task_latent_source(source, index, demonstration)
+        outcomes = evaluate_policy(make_env(task, statistics, transform), policy, seeds)
+    report(episodes)
+    rows = [
+        ResultRow(
+            task=task,
+            policy=policy_name,
+            latent_source=source,
+            seed=config.seed,
+            episode=i,
+            episode_return=outcome.episode_return,
+            success=outcome.success,
+        )
+        for i, outcome in enumerate(outcomes)
+    ]
+    write_results(path, rows)
+    return rows
+
+
+def expert_outcomes(config: Config, task: str, seeds: list[int]) -> list[EpisodeOutcome]:
+    """The expert's episodes: fresh ones on the evaluation's starts, or its demonstrations."""
+    if config.evaluate.expert_rollouts:
+        return [
+            EpisodeOutcome(float(episode.rewards.sum()), bool(episode.successes.any()))
+            for episode in (
+                collect_episode(
+                    task, seed, noise=config.collect.noise, gains=config.collect.gains
+                )
+                for seed in seeds
+            )
+        ]
+    demonstrations = read_demonstrations(demonstration_path(Path(config.run_dir) / "data", task))
+    return [
+        EpisodeOutcome(float(demo["rewards"].sum()), bool(demo["successes"].any()))
+        for demo in demonstrations
+    ]
+
+
+def embed_held_out(config: Config) -> tuple[Embeddings, float]:
+    """Embeddings of the held-out demonstrations and the classifier's accuracy on them."""
+    data_dir = Path(config.run_dir) / "data"
+    statistics = read_statistics(data_dir)
+    student, _ = load_student(Path(config.run_dir) / "distill" / "checkpoint.safetensors")
+    held_out, distances = [], []
+    for index, task in enumerate(config.tasks):
+        held_out.append(
+            load_transitions(data_dir, task, statistics, split="valid", num_task=index)
+        )
+        for demo in read_demonstrations(demonstration_path(data_dir, task), split="valid"):
+            offset = demo["obs"]["robot0_eef_pos"] - demo["obs"]["goal_pos"]
+            distances.append(np.linalg.norm(offset, axis=-1))
+    data = torch.cat([part.select(*held_out[0].keys(True, True)) for part in held_out])
+    # Class indices are positions in config.tasks; the report's are positions among all tasks.
+    position = torch.tensor([TASKS.index(task) for task in config.tasks])
+    embeddings = Embeddings(
+        task_latent=student.embed(data).numpy(),
+        task=position[data["task"]].numpy(),
+        episode=data["episode"].numpy(),
+        step=data["step"].numpy(),
+        distance=np.concatenate(distances),
+    )
+    return embeddings, student.accuracy(data)
+
+
+def evaluate(config: Config) -> None:
+    """Evaluates every policy on every task, then writes ``results.csv`` and the report."""
+    run_dir = Path(config.run_dir)
+    policies = [("expert", ""), ("bcq", "")]
+    policies += [("distilled", source) for source in config.evaluate.latent_sources]
+    jobs = [(config, task, *policy) for policy in policies for task in config.tasks]
+    rows = run_jobs(
+        evaluate_job,
+        jobs,
+        workers=config.workers,
+        total=len(jobs) * config.evaluate.episodes,
+        description="evaluating",
+        unit="episode",
+    )
+    write_results(run_dir / "results.csv", [row for part in rows for row in part])
+    embeddings, accuracy = embed_held_out(config)
+    write_report(
+        run_dir,
+        default_source=config.evaluate.latent_sources[0],
+        facts=run_facts(config),
+        embeddings=embeddings,
+        accuracy=accuracy,
+        seed=config.seed,
+    )
+    print((run_dir / "tables" / "results.md").read_text())
+    print(f"report: {run_dir / 'report.html'}")
+
+
+def run_facts(config: Config) -> dict[str, str]:
+    """What the report says about the run."""
+    versions = read_versions(Path(config.run_dir))
+    demonstrations = ", ".join(
+        f"{task} {config.collect.train_episodes[task]}" for task in config.tasks
+    )
+    return {
+        "Seed": str(config.seed),
+        "Demonstrations": f"{demonstrations}; {config.collect.valid_episodes} held out of each",
+        "Stage 1": f"{config.bcq.epochs} epochs of {config.bcq.updates_per_epoch} updates",
+        "Stage 2": f"{config.distill.updates} updates",
+        "Versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
+    }
+
+
+@hydra.main(version_base="1.3", config_path="config", config_name="recipe")
+def main(config: DictConfig) -> None:
+    """Command line."""
+    run_recipe(config, evaluate)
+
+
+if __name__ == "__main__":
+    main()

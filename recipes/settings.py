@@ -1,0 +1,159 @@
+"""Typed settings of the recipes; the presets under ``config/preset`` fill them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Optional
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING, DictConfig, OmegaConf
+
+from torchrl_bmrl.agents import LATENT_SOURCES
+from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
+from torchrl_bmrl.experts.controllers import ExpertGains
+from torchrl_bmrl.names import TASKS, check_task
+from torchrl_bmrl.runs import LOGGERS, open_run
+
+
+@dataclass
+class CollectSettings:
+    """Demonstrations of the scripted experts."""
+
+    train_episodes: dict[str, int] = MISSING  # by task
+    valid_episodes: int = MISSING  # held out, of each task
+    noise: float = 0.2  # standard deviation on every action dimension
+    gains: ExpertGains = field(default_factory=ExpertGains)
+
+
+@dataclass
+class BCQSettings:
+    """Stage 1: one Batch-Constrained Q-learning agent per task."""
+
+    epochs: int = MISSING
+    updates_per_epoch: int = MISSING
+    eval_episodes: int = MISSING  # after each epoch, for the curves
+    batch_size: int = 128
+    lr: float = 1e-3
+    num_cells: list[int] = field(default_factory=lambda: [256, 256])
+    num_qvalue_nets: int = 2
+    num_candidates: int = 10  # in the target
+    lmbda: float = 0.75
+    latent_clip: Optional[float] = 0.5  # null turns it off
+    kl_weight: float = 0.5
+    gamma: float = 0.99
+    tau: float = 0.005
+    perturbation: bool = False  # the paper has none
+    max_perturbation: float = 0.05
+    loss_function: str = "l2"
+
+
+@dataclass
+class DistillSettings:
+    """Stage 2: one student for all tasks."""
+
+    updates: int = MISSING
+    batch_size: int = 64  # of each task
+    lr: float = 1e-3
+    cosine: bool = True  # decay of the learning rate to zero
+    num_cells: list[int] = field(default_factory=lambda: [256, 256])
+    task_latent_dim: int = 2
+    context: str = "previous"  # current (the paper's), previous, random, set
+    context_fraction: float = 0.5
+    context_size: int = 8
+    detach_task_latent: bool = False  # True: cross-entropy alone trains the encoder
+    classification_weight: float = 1.0
+    generator_weight: float = 1.0
+    direction_weight: float = 1.0
+    qvalue_weight: float = 1.0
+    latent_norm_weight: float = 2e-3
+    normalise_qvalue: bool = True
+    prototype: str = "mean"  # or medoid
+
+
+@dataclass
+class EvaluateSettings:
+    """Episodes from starts that no demonstration had."""
+
+    episodes: int = MISSING  # of each task and policy
+    num_candidates: int = 100
+    latent_sources: list[str] = field(default_factory=lambda: ["prototype"])
+    expert_rollouts: bool = False  # False: the expert's rows are its demonstrations
+
+
+@dataclass
+class Config:
+    """Everything that decides a run; ``config.yaml`` in the run folder is one of these."""
+
+    seed: int = 0
+    run_dir: str = "runs/${hydra:job.name}-${hydra:runtime.choices.preset}-seed${seed}"
+    tasks: list[str] = field(default_factory=lambda: list(TASKS))
+    workers: int = 2  # processes; does not change any result
+    logger: str = "csv"  # csv, wandb, tensorboard, none
+    log_interval: int = 100  # updates
+    checkpoint_interval: int = 1000  # updates
+    collect: CollectSettings = field(default_factory=CollectSettings)
+    bcq: BCQSettings = field(default_factory=BCQSettings)
+    distill: DistillSettings = field(default_factory=DistillSettings)
+    evaluate: EvaluateSettings = field(default_factory=EvaluateSettings)
+
+
+POSITIVE = (
+    "workers",
+    "log_interval",
+    "checkpoint_interval",
+    "bcq.epochs",
+    "bcq.updates_per_epoch",
+    "bcq.batch_size",
+    "bcq.lr",
+    "distill.updates",
+    "distill.batch_size",
+    "distill.lr",
+    "distill.task_latent_dim",
+    "evaluate.episodes",
+    "evaluate.num_candidates",
+)
+
+
+def check_settings(config: Config) -> None:
+    """Checks what types cannot say.
+
+    Raises:
+        BMRLError: naming the key, its value and what is valid.
+    """
+    for task in [*config.tasks, *config.collect.train_episodes]:
+        check_task(task)
+    missing = [task for task in config.tasks if task not in config.collect.train_episodes]
+    if not config.tasks or missing:
+        raise ConfigError(
+            f"tasks is {config.tasks}; valid: at least one, each with a number in "
+            "collect.train_episodes"
+        )
+    for source in config.evaluate.latent_sources:
+        if source not in LATENT_SOURCES:
+            raise UnknownNameError("latent source", source, LATENT_SOURCES)
+    if config.logger not in LOGGERS:
+        raise UnknownNameError("logger", config.logger, LOGGERS)
+    for key in POSITIVE:
+        value = OmegaConf.select(OmegaConf.structured(config), key)
+        if value <= 0:
+            raise ConfigError(f"{key} is {value}; valid: above 0")
+    if config.collect.valid_episodes < 1 or min(config.collect.train_episodes.values()) < 1:
+        raise ConfigError("collect.train_episodes and collect.valid_episodes; valid: at least 1")
+
+
+def run_recipe(settings: DictConfig, run: Callable[[Config], None]) -> None:
+    """Runs a recipe in its run folder; an expected error becomes one line and exit code 1."""
+    try:
+        config = OmegaConf.to_object(settings)
+        check_settings(config)
+        open_run(Path(config.run_dir), OmegaConf.to_container(settings, resolve=True))
+        run(config)
+    except BMRLError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+
+
+ConfigStore.instance().store(name="schema", node=Config)

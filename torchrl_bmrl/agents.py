@@ -1,0 +1,175 @@
+"""What a stage's checkpoint holds, and how to make it act again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs.transforms import Transform
+
+from torchrl_bmrl.checkpoint import load_checkpoint, load_state
+from torchrl_bmrl.errors import UnknownNameError
+from torchrl_bmrl.modules import (
+    ActionVAE,
+    BCQPolicy,
+    DemonstrationTaskLatent,
+    OnlineTaskLatent,
+    PrototypeTaskLatent,
+    make_decoder,
+    make_perturbation_network,
+    make_qvalue_network,
+    make_task_classifier,
+    make_task_encoder,
+    prototype,
+)
+from torchrl_bmrl.objectives import BCQLoss
+
+OBSERVATION_DIM, ACTION_DIM = 33, 7
+
+
+def make_bcq_loss(
+    *,
+    num_cells: Sequence[int] = (256, 256),
+    num_qvalue_nets: int = 2,
+    perturbation: bool = False,
+    observation_dim: int = OBSERVATION_DIM,
+    action_dim: int = ACTION_DIM,
+    **options: Any,
+) -> BCQLoss:
+    """A :class:`BCQLoss` over freshly initialised networks.
+
+    Args:
+        num_cells: widths of the hidden layers of every network.
+        num_qvalue_nets: number of critics.
+        perturbation: whether there is a perturbation network.
+        observation_dim: size of the observation.
+        action_dim: size of the action.
+        **options: of :class:`BCQLoss`.
+
+    Example:
+        >>> make_bcq_loss(num_cells=(8,), observation_dim=3, action_dim=2).num_qvalue_nets
+        2
+    """
+    dims = (observation_dim, action_dim)
+    return BCQLoss(
+        ActionVAE(*dims, num_cells=num_cells),
+        [make_qvalue_network(*dims, num_cells=num_cells) for _ in range(num_qvalue_nets)],
+        make_perturbation_network(*dims, num_cells=num_cells) if perturbation else None,
+        bounds=(-1.0, 1.0),
+        **options,
+    )
+
+
+def load_bcq_loss(path: Path) -> tuple[BCQLoss, dict[str, Any]]:
+    """A trained BCQ and its checkpoint's metadata (``task``, ``statistics``, ...).
+
+    Raises:
+        CheckpointError: if the file is missing, damaged, of another kind or of other shapes.
+    """
+    state, metadata = load_checkpoint(path, kind="bcq")
+    loss = make_bcq_loss(**metadata["loss"])
+    load_state(loss, state["loss"], path)
+    return loss.requires_grad_(False), metadata
+
+
+class Student(nn.Module):
+    """The networks of stage 2: encoder M, classifier P, generator Ĝ, critic Q̂.
+
+    Args:
+        num_tasks: number of teachers.
+        task_latent_dim: size of m.
+        num_cells: widths of the hidden layers.
+        latent_dim: size of ``action_latent``, the teachers'.
+        observation_dim: size of the observation.
+        action_dim: size of the action.
+    """
+
+    def __init__(
+        self,
+        *,
+        num_tasks: int,
+        task_latent_dim: int = 2,
+        num_cells: Sequence[int] = (256, 256),
+        latent_dim: int = 2 * ACTION_DIM,
+        observation_dim: int = OBSERVATION_DIM,
+        action_dim: int = ACTION_DIM,
+    ) -> None:
+        super().__init__()
+        dims = (observation_dim, action_dim)
+        self.latent_dim = latent_dim
+        self.task_encoder = make_task_encoder(*dims, task_latent_dim, num_cells=num_cells)
+        self.task_classifier = make_task_classifier(num_tasks, task_latent_dim)
+        self.generator = make_decoder(
+            *dims, latent_dim, task_latent_dim=task_latent_dim, num_cells=num_cells
+        )
+        self.qvalue_network = make_qvalue_network(
+            *dims, task_latent_dim=task_latent_dim, num_cells=num_cells
+        )
+        self.register_buffer("prototypes", torch.zeros(num_tasks, task_latent_dim))
+
+    @torch.no_grad()
+    def embed(self, data: TensorDictBase) -> Tensor:
+        """Embedding of each transition, ``(*B, task_latent_dim)``."""
+        return self.task_encoder(data.select(*self.task_encoder.in_keys)).get("task_latent")
+
+    @torch.no_grad()
+    def set_prototypes(self, datasets: Sequence[TensorDictBase], kind: str) -> None:
+        """Takes each task's prototype from its training data."""
+        points = [prototype(self.embed(data), kind) for data in datasets]
+        self.prototypes.copy_(torch.stack(points))
+
+    @torch.no_grad()
+    def accuracy(self, data: TensorDictBase) -> float:
+        """Share of transitions whose task the classifier names."""
+        logits = self.task_classifier.module(self.embed(data))
+        return (logits.argmax(-1) == data.get("task")).float().mean().item()
+
+    def policy(self, *, num_candidates: int, latent_clip: float | None) -> BCQPolicy:
+        """The distilled policy; it reads ``task_latent``."""
+        return BCQPolicy(
+            self.generator,
+            self.qvalue_network,
+            latent_dim=self.latent_dim,
+            num_candidates=num_candidates,
+            latent_clip=latent_clip,
+        )
+
+    def task_latent_source(
+        self, source: str, task: int, demonstration: TensorDictBase | None = None
+    ) -> Transform:
+        """The transform that writes ``task_latent`` while the policy acts.
+
+        Args:
+            source: ``"prototype"``, ``"online"`` or ``"demonstration"``.
+            task: class index.
+            demonstration: transitions of one episode, for the last source.
+
+        Raises:
+            UnknownNameError: for another source.
+        """
+        if source == "prototype":
+            return PrototypeTaskLatent(self.prototypes[task])
+        if source == "online":
+            return OnlineTaskLatent(self.task_encoder, self.prototypes[task])
+        if source == "demonstration":
+            return DemonstrationTaskLatent(demonstration, self.task_encoder)
+        raise UnknownNameError("latent source", source, LATENT_SOURCES)
+
+
+LATENT_SOURCES = ("prototype", "online", "demonstration")
+
+
+def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
+    """A distilled student and its checkpoint's metadata.
+
+    Raises:
+        CheckpointError: if the file is missing, damaged, of another kind or of other shapes.
+    """
+    state, metadata = load_checkpoint(path, kind="student")
+    student = Student(**metadata["student"])
+    load_state(student, state["student"], path)
+    return student.requires_grad_(False), metadata

@@ -1,0 +1,165 @@
+"""Episodes of the scripted experts, one file each until a task is complete."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from torchrl_bmrl.data.robomimic import (
+    Episode,
+    count_episodes,
+    read_episode,
+    write_demonstrations,
+    write_episode,
+)
+from torchrl_bmrl.envs.tasks import SawyerEnv, robosuite_metadata
+from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.experts.controllers import ExpertGains, make_expert
+from torchrl_bmrl.names import HORIZON, TASKS, check_task
+from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeJob:
+    """One episode to collect.
+
+    Attributes:
+        task: its task.
+        seed: decides start and noise.
+        noise: standard deviation of the Gaussian noise on each action dimension.
+        path: where the episode is kept.
+        gains: of the expert.
+    """
+
+    task: str
+    seed: int
+    noise: float
+    path: Path
+    gains: ExpertGains = field(default_factory=ExpertGains)
+
+
+@functools.lru_cache(maxsize=None)
+def _env(task: str) -> SawyerEnv:
+    return SawyerEnv(task)  # costs a second: kept for the worker's life
+
+
+def collect_episode(task: str, seed: int, *, noise: float, gains: ExpertGains) -> Episode:
+    """One episode of the expert of ``task``, 200 steps, reproduced by ``seed``."""
+    env = _env(task)
+    observation, _ = env.reset(seed=seed)
+    expert = make_expert(task, env.robosuite_env, gains)
+    rng = np.random.default_rng(derive_seed(seed, "action noise"))
+    observations = {name: [part] for name, part in observation.items()}
+    states = [env.robosuite_env.sim.get_state().flatten()]
+    actions, rewards, successes, phases = [], [], [], []
+    for _ in range(HORIZON):
+        # What is stored is what was executed, to the bit.
+        noisy = expert() + noise * rng.standard_normal(7)
+        action = np.clip(noisy, -1.0, 1.0).astype(np.float32)
+        phases.append(expert.phase)
+        observation, reward, _, _, info = env.step(action)
+        for name, part in observation.items():
+            observations[name].append(part)
+        states.append(env.robosuite_env.sim.get_state().flatten())
+        actions.append(action)
+        rewards.append(reward)
+        successes.append(info["success"])
+    return Episode(
+        observations={name: np.stack(parts) for name, parts in observations.items()},
+        actions=np.stack(actions),
+        rewards=np.array(rewards),
+        successes=np.array(successes),
+        phases=np.array(phases, dtype=np.int8),
+        states=np.stack(states),
+        seed=seed,
+        phase_names=expert.phases,
+    )
+
+
+def _collect_job(job: EpisodeJob, report: Report) -> None:
+    write_episode(job.path, collect_episode(job.task, job.seed, noise=job.noise, gains=job.gains))
+    report(1)
+
+
+def collect_demonstrations(
+    directory: Path,
+    episodes: dict[str, int],
+    *,
+    valid_episodes: int,
+    noise: float,
+    seed: int,
+    workers: int,
+    gains: ExpertGains | None = None,
+) -> dict[str, Path]:
+    """Collects demonstrations, one robomimic-layout HDF5 file per task.
+
+    Every finished episode is kept under ``directory/.episodes`` at once; the same call after a kill
+    goes on with the missing ones. A task's file appears, complete, when its last episode is there.
+
+    Args:
+        directory: where ``<task>.hdf5`` is written.
+        episodes: number of episodes to train on, by task.
+        valid_episodes: further episodes of each task, held out under ``mask/valid``.
+        noise: standard deviation of the Gaussian action noise.
+        seed: episode i of a task is the same in every collection with this seed.
+        workers: processes.
+        gains: of the experts.
+
+    Returns:
+        the file of each task.
+
+    Raises:
+        UnknownNameError: for a name that is not a task.
+        DataError: if a finished file holds another number of episodes than asked for.
+    """
+    gains = gains or ExpertGains()
+    files = {check_task(task): directory / f"{task}.hdf5" for task in episodes}
+    counts = {task: number + valid_episodes for task, number in episodes.items()}
+    parts = {
+        task: [directory / ".episodes" / task / f"{i:05d}.npz" for i in range(counts[task])]
+        for task in files
+        if not files[task].exists()
+    }
+    jobs = [
+        EpisodeJob(
+            task=task,
+            seed=derive_seed(seed, "collect", task, i),
+            noise=noise,
+            path=path,
+            gains=gains,
+        )
+        for task in sorted(parts, key=TASKS.index)
+        for i, path in enumerate(parts[task])
+        if not path.exists()
+    ]
+    run_jobs(
+        _collect_job,
+        jobs,
+        workers=workers,
+        total=len(jobs),
+        description="collecting demonstrations",
+        unit="episode",
+    )
+    for task, paths in parts.items():
+        write_demonstrations(
+            files[task],
+            (read_episode(path) for path in paths),
+            train_episodes=episodes[task],
+            env_args=robosuite_metadata(task),
+            attributes={"task": task, "action_noise": noise, "seed": seed},
+        )
+        for path in paths:
+            path.unlink()
+        paths[0].parent.rmdir()
+    for task, path in files.items():
+        if count_episodes(path) != counts[task]:
+            raise DataError(
+                path,
+                "data",
+                f"holds {count_episodes(path)} episodes where {counts[task]} are asked for; "
+                "give another run_dir or remove the file",
+            )
+    return files

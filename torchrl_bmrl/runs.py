@@ -1,0 +1,165 @@
+"""Run folders: what a run was told, on what it ran, and whether it may go on."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import math
+import os
+import platform
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from torchrl_bmrl import __version__
+from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
+from torchrl_bmrl.files import write_atomic
+
+FREE_TO_CHANGE = ("run_dir", "workers", "logger")
+"""Settings that do not change a run's result, and so may differ when it goes on."""
+LOGGERS = ("csv", "wandb", "tensorboard", "none")
+PACKAGES = ("torch", "torchrl", "tensordict", "robosuite", "mujoco", "gymnasium", "numpy", "h5py")
+
+
+def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
+    """Creates a run folder, or checks that an existing one was told the same.
+
+    Writes ``config.yaml`` (everything that decides the run) and ``versions.json``.
+
+    Args:
+        run_dir: the folder.
+        settings: the resolved configuration.
+
+    Raises:
+        ConfigError: if the folder holds a run with other settings; the first that differs is named.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> open_run(folder, {"seed": 0})
+        >>> open_run(folder, {"seed": 1})
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.ConfigError: ...: seed is 1 here and 0 in the run that the folder holds...
+    """
+    path = run_dir / "config.yaml"
+    if path.exists():
+        before = dict(_flat(read_settings(run_dir)))
+        now = dict(_flat(settings))
+        for key in sorted(before | now):
+            if key.split(".")[0] in FREE_TO_CHANGE or before.get(key) == now.get(key):
+                continue
+            raise ConfigError(
+                f"{run_dir}: {key} is {now.get(key)} here and {before.get(key)} in the run that the "
+                "folder holds; give the same settings to go on, or another run_dir"
+            )
+        return
+    versions = {name: _version(name) for name in PACKAGES}
+    versions |= {"torchrl_bmrl": __version__, "python": platform.python_version()}
+    write_atomic(run_dir / "versions.json", json.dumps(versions, indent=2) + "\n")
+    write_atomic(path, yaml.safe_dump(dict(settings), sort_keys=False))
+
+
+def read_settings(run_dir: Path) -> dict[str, Any]:
+    """The configuration of a run folder.
+
+    Raises:
+        DataError: if there is none, or it is not YAML.
+    """
+    path = run_dir / "config.yaml"
+    if not path.is_file():
+        raise DataError(path, None, "no such file; valid: the folder of a run")
+    try:
+        settings = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise DataError(path, None, f"not YAML ({error})") from error
+    if not isinstance(settings, dict):
+        raise DataError(path, None, "not a mapping of settings")
+    return settings
+
+
+def read_versions(run_dir: Path) -> dict[str, str]:
+    """Versions of what the run uses.
+
+    Raises:
+        DataError: if the folder has no ``versions.json``, or it is damaged.
+    """
+    path = run_dir / "versions.json"
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise DataError(path, None, f"not the versions of a run ({error})") from error
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def make_logger(kind: str, run_dir: Path, name: str) -> Any:
+    """One of TorchRL's loggers, writing under ``run_dir/logs``.
+
+    Args:
+        kind: ``"csv"``, ``"wandb"``, ``"tensorboard"`` or ``"none"``.
+        run_dir: the run folder.
+        name: of the experiment, such as ``"bcq_lift"``.
+
+    Returns:
+        a :class:`torchrl.record.loggers.Logger`, or ``None`` for ``"none"``. Weights & Biases runs
+        offline where no account is configured, unless ``WANDB_MODE`` says otherwise.
+
+    Raises:
+        UnknownNameError: for another kind.
+    """
+    if kind not in LOGGERS:
+        raise UnknownNameError("logger", kind, LOGGERS)
+    if kind == "none":
+        return None
+    from torchrl.record.loggers import get_logger
+
+    options: dict[str, Any] = {}
+    if kind == "wandb":
+        import wandb
+
+        mode = os.environ.get("WANDB_MODE") or ("online" if wandb.api.api_key else "offline")
+        options["wandb_kwargs"] = {"mode": mode, "project": "torchrl_bmrl", "dir": str(run_dir)}
+    return get_logger(kind, str(run_dir / "logs"), name, **options)
+
+
+def log_metrics(logger: Any, metrics: Mapping[str, Any], step: int) -> None:
+    """Logs scalars under their names; does nothing without a logger."""
+    if logger is not None:
+        for name, value in metrics.items():
+            logger.log_scalar(name, float(value), step=step)
+
+
+def check_finite(metrics: Mapping[str, Any], where: str) -> None:
+    """Stops a run whose losses are not finite any more.
+
+    Raises:
+        BMRLError: naming the first such metric.
+
+    Example:
+        >>> check_finite({"loss_qvalue": float("nan")}, "bcq lift, update 100")
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.BMRLError: bcq lift, update 100: loss_qvalue is nan; ...
+    """
+    for name, value in metrics.items():
+        if not math.isfinite(float(value.detach() if isinstance(value, torch.Tensor) else value)):
+            raise BMRLError(
+                f"{where}: {name} is {float(value)}; the last checkpoint is kept, "
+                "a lower learning rate may help"
+            )
