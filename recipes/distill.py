@@ -1,7 +1,7 @@
 """Stage 2: the agents of all tasks into one policy conditioned on a learned embedding.
 
-    python recipes/distill.py run_dir=runs/mine             # after recipes/train_bcq.py
-    python recipes/distill.py preset=literal run_dir=runs/literal
+python recipes/distill.py run_dir=runs/mine             # after recipes/train_bcq.py
+python recipes/distill.py preset=literal run_dir=runs/literal
 """
 
 from __future__ import annotations
@@ -119,8 +119,9 @@ def train_student(config: Config, report: Report) -> None:
             decay.step()
         report(1)
         if update % config.log_interval == 0:
-            check_finite(losses, f"distillation, update {update}")
-            log_metrics(logger, losses, update)
+            metrics = losses.detach()
+            check_finite(metrics, f"distillation, update {update}")
+            log_metrics(logger, metrics, update)
         if update % config.checkpoint_interval == 0 or update == settings.updates:
             student.set_prototypes(train, settings.prototype)
             state = {

@@ -1,7 +1,7 @@
 """Episodes from starts that no demonstration had, and the report.
 
-    python recipes/evaluate.py run_dir=runs/mine            # after recipes/distill.py
-    python recipes/evaluate.py run_dir=runs/mine "evaluate.latent_sources=[prototype,online]"
+python recipes/evaluate.py run_dir=runs/mine            # after recipes/distill.py
+python recipes/evaluate.py run_dir=runs/mine "evaluate.latent_sources=[prototype,online]"
 """
 
 from __future__ import annotations
@@ -83,9 +83,7 @@ def expert_outcomes(config: Config, task: str, seeds: list[int]) -> list[Episode
         return [
             EpisodeOutcome(float(episode.rewards.sum()), bool(episode.successes.any()))
             for episode in (
-                collect_episode(
-                    task, seed, noise=config.collect.noise, gains=config.collect.gains
-                )
+                collect_episode(task, seed, noise=config.collect.noise, gains=config.collect.gains)
                 for seed in seeds
             )
         ]
@@ -103,9 +101,7 @@ def embed_held_out(config: Config) -> tuple[Embeddings, float]:
     student, _ = load_student(Path(config.run_dir) / "distill" / "checkpoint.safetensors")
     held_out, distances = [], []
     for index, task in enumerate(config.tasks):
-        held_out.append(
-            load_transitions(data_dir, task, statistics, split="valid", num_task=index)
-        )
+        held_out.append(load_transitions(data_dir, task, statistics, split="valid", num_task=index))
         for demo in read_demonstrations(demonstration_path(data_dir, task), split="valid"):
             offset = demo["obs"]["robot0_eef_pos"] - demo["obs"]["goal_pos"]
             distances.append(np.linalg.norm(offset, axis=-1))

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Optional
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -41,7 +40,7 @@ class BCQSettings:
     num_qvalue_nets: int = 2
     num_candidates: int = 10  # in the target
     lmbda: float = 0.75
-    latent_clip: Optional[float] = 0.5  # null turns it off
+    latent_clip: float | None = 0.5  # null turns it off
     kl_weight: float = 0.5
     gamma: float = 0.99
     tau: float = 0.005

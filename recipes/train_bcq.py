@@ -1,7 +1,7 @@
 """Stage 1: one Batch-Constrained Q-learning agent per task, from demonstrations alone.
 
-    python recipes/train_bcq.py run_dir=runs/mine           # after recipes/collect.py
-    python recipes/train_bcq.py preset=smoke tasks=[lift]
+python recipes/train_bcq.py run_dir=runs/mine           # after recipes/collect.py
+python recipes/train_bcq.py preset=smoke tasks=[lift]
 """
 
 from __future__ import annotations

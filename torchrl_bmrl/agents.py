@@ -88,6 +88,8 @@ class Student(nn.Module):
         action_dim: size of the action.
     """
 
+    prototypes: Tensor
+
     def __init__(
         self,
         *,
@@ -125,7 +127,8 @@ class Student(nn.Module):
     @torch.no_grad()
     def accuracy(self, data: TensorDictBase) -> float:
         """Share of transitions whose task the classifier names."""
-        logits = self.task_classifier.module(self.embed(data))
+        encoded = self.task_encoder(data.select(*self.task_encoder.in_keys))
+        logits = self.task_classifier(encoded).get("task_logits")
         return (logits.argmax(-1) == data.get("task")).float().mean().item()
 
     def policy(self, *, num_candidates: int, latent_clip: float | None) -> BCQPolicy:

@@ -59,8 +59,9 @@ def run_jobs(
         BMRLError: if a worker is killed.
 
     Example:
-        >>> run_jobs(lambda job, report: 2 * job, [1, 2], workers=1, total=2, description="",
-        ...     unit="")
+        >>> run_jobs(
+        ...     lambda job, report: 2 * job, [1, 2], workers=1, total=2, description="", unit=""
+        ... )
         [2, 4]
     """
     jobs = list(jobs)

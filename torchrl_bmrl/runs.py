@@ -42,7 +42,7 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
         >>> open_run(folder, {"seed": 1})
         Traceback (most recent call last):
         ...
-        torchrl_bmrl.errors.ConfigError: ...: seed is 1 here and 0 in the run that the folder holds...
+        torchrl_bmrl.errors.ConfigError: ...: seed is 1 here and 0 in the folder's run; ...
     """
     path = run_dir / "config.yaml"
     if path.exists():
@@ -52,8 +52,8 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
             if key.split(".")[0] in FREE_TO_CHANGE or before.get(key) == now.get(key):
                 continue
             raise ConfigError(
-                f"{run_dir}: {key} is {now.get(key)} here and {before.get(key)} in the run that the "
-                "folder holds; give the same settings to go on, or another run_dir"
+                f"{run_dir}: {key} is {now.get(key)} here and {before.get(key)} in the folder's "
+                "run; give the same settings to go on, or another run_dir"
             )
         return
     versions = {name: _version(name) for name in PACKAGES}
@@ -158,7 +158,7 @@ def check_finite(metrics: Mapping[str, Any], where: str) -> None:
         torchrl_bmrl.errors.BMRLError: bcq lift, update 100: loss_qvalue is nan; ...
     """
     for name, value in metrics.items():
-        if not math.isfinite(float(value.detach() if isinstance(value, torch.Tensor) else value)):
+        if not math.isfinite(float(value)):
             raise BMRLError(
                 f"{where}: {name} is {float(value)}; the last checkpoint is kept, "
                 "a lower learning rate may help"

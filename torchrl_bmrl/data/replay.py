@@ -44,8 +44,13 @@ def stack_episodes(episodes: Sequence[Mapping[str, Any]], *, task: int) -> Tenso
 
     Example:
         >>> part = np.zeros((5, 3))
-        >>> episode = {"obs": {"x": part}, "next_obs": {"x": part}, "actions": np.zeros((5, 2)),
-        ...     "rewards": np.zeros(5), "successes": np.zeros(5, bool)}
+        >>> episode = {
+        ...     "obs": {"x": part},
+        ...     "next_obs": {"x": part},
+        ...     "actions": np.zeros((5, 2)),
+        ...     "rewards": np.zeros(5),
+        ...     "successes": np.zeros(5, bool),
+        ... }
         >>> data = stack_episodes([episode, episode], task=1)
         >>> data.batch_size, data["next", "truncated"].sum().item()
         (torch.Size([10]), 2)

@@ -198,7 +198,9 @@ def read_demonstrations(
             demo = file["data"][name]
             arrays: dict[str, np.ndarray] = {}
             wanted = ["actions", "rewards", "successes"]
-            wanted += [f"{group}/{part}" for group in ("obs", "next_obs") for part in observation_keys]
+            wanted += [
+                f"{group}/{part}" for group in ("obs", "next_obs") for part in observation_keys
+            ]
             for key in wanted:
                 if key not in demo:
                     raise DataError(path, f"data/{name}/{key}", "missing")

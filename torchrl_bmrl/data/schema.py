@@ -53,7 +53,10 @@ def check_episode(path: Path, demo: str, arrays: Mapping[str, np.ndarray]) -> No
         if key == "actions":
             expected = (steps, ACTION_DIM)
         elif "/" in key:
-            expected = (steps, OBSERVATION_SHAPES.get(part, array.shape[-1] if array.ndim > 1 else 1))
+            expected = (
+                steps,
+                OBSERVATION_SHAPES.get(part, array.shape[-1] if array.ndim > 1 else 1),
+            )
         if array.shape != expected:
             raise DataError(path, name, f"shape {array.shape}; valid: {expected}")
         finite = np.isfinite(array)

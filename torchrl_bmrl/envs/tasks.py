@@ -283,6 +283,7 @@ class BMRLSawyerReach(_BMRLSawyerTask):
 
     @property
     def goal(self) -> np.ndarray:
+        """The point to reach (3,) [m]."""
         return self._goal.copy()
 
     def _check_success(self) -> bool:
@@ -296,6 +297,7 @@ class BMRLSawyerLift(_BMRLSawyerTask):
         return self._place_cube() + np.array([0.0, 0.0, HOVER_HEIGHT])
 
     def reward_terms(self) -> dict[str, float]:
+        """Distance to the cube, grasp, height."""
         return super().reward_terms() | {
             "grasp": float(self.grasped),
             "lift": float(self.cube_displacement[2] > LIFT_SUCCESS_HEIGHT),
@@ -322,6 +324,7 @@ class BMRLSawyerPush(_BMRLSawyerTask):
         return self._place_cube() + np.array([0.0, 0.0, HOVER_HEIGHT])
 
     def reward_terms(self) -> dict[str, float]:
+        """Distance to the cube, the cube's velocity, its distance from the start."""
         velocity = self.sim.data.get_joint_qvel(self.cube.joints[0])[:3]
         moved = float(np.linalg.norm(self.cube_displacement))
         return super().reward_terms() | {
@@ -397,7 +400,7 @@ class SawyerEnv(gymnasium.Env):
         (False, False)
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata = {  # noqa: RUF012 (gymnasium's convention)
         "render_modes": ["rgb_array"],
         "render_fps": CONTROL_FREQUENCY,
     }

@@ -44,9 +44,7 @@ def rollout_episode(
     """
     with torch.random.fork_rng(devices=[]), torch.no_grad():
         torch.manual_seed(seed)
-        return env.rollout(
-            max_steps, policy, tensordict=env.reset(seed=seed), auto_reset=False
-        )
+        return env.rollout(max_steps, policy, tensordict=env.reset(seed=seed), auto_reset=False)
 
 
 def evaluate_policy(

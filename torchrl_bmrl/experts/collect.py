@@ -41,7 +41,7 @@ class EpisodeJob:
     gains: ExpertGains = field(default_factory=ExpertGains)
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def _env(task: str) -> SawyerEnv:
     return SawyerEnv(task)  # costs a second: kept for the worker's life
 

@@ -98,6 +98,7 @@ class LiftExpert(Expert):
     phases = ("descend", "grasp", "lift")
 
     def reset(self) -> None:
+        """Starts over, gripper open."""
         super().reset()
         self._closing = 0
 
@@ -160,8 +161,9 @@ class PushExpert(Expert):
             self.phase = 2
         if self.phase == 0:
             # Rise first, so as not to knock the cube on the way to its other side.
+            lift = np.array([0.0, 0.0, 0.05])
             clear = behind + np.array([0.0, 0.0, 0.08])
-            target = clear if height > 0.045 or horizontal < 0.03 else eef + [0.0, 0.0, 0.05]
+            target = clear if height > 0.045 or horizontal < 0.03 else eef + lift
             return target, CLOSE, self.gains.speed_limit
         if self.phase == 1:
             return behind, CLOSE, self.gains.speed_limit

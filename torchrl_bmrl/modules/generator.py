@@ -25,9 +25,7 @@ def make_mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> M
 class _Posterior(nn.Module):
     """Mean and standard deviation of the latent, log-deviation clamped as published."""
 
-    def __init__(
-        self, in_features: int, latent_dim: int, num_cells: Sequence[int]
-    ) -> None:
+    def __init__(self, in_features: int, latent_dim: int, num_cells: Sequence[int]) -> None:
         super().__init__()
         self.network = make_mlp(in_features, 2 * latent_dim, num_cells)
 
@@ -76,9 +74,9 @@ class ActionVAE(TensorDictModuleBase):
         observation_key: key of the observation.
 
     ``encoder`` reads ``observation (*B, observation_dim)`` and ``action (*B, action_dim)`` and
-    writes ``action_latent_loc`` and ``action_latent_scale``, ``(*B, latent_dim)``. ``decoder`` reads
-    ``observation`` and ``action_latent`` and writes ``action``. :meth:`forward` proposes actions:
-    it draws z ~ N(0, I) where the input has none, and decodes.
+    writes ``action_latent_loc`` and ``action_latent_scale``, ``(*B, latent_dim)``. ``decoder``
+    reads ``observation`` and ``action_latent`` and writes ``action``.
+    :meth:`forward` proposes actions: it draws z ~ N(0, I) where the input has none, and decodes.
 
     Example:
         >>> from tensordict import TensorDict
@@ -118,7 +116,7 @@ class ActionVAE(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Proposes one action per row."""
-        if "action_latent" not in tensordict.keys():
+        if tensordict.get("action_latent", None) is None:
             observation = tensordict.get(self.in_keys[0])
             shape = (*tensordict.batch_size, self.latent_dim)
             latent = torch.randn(shape, device=observation.device, dtype=observation.dtype)

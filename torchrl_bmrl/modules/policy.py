@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.objectives.functional import perturbed_action, sample_action_latent
+from torchrl_bmrl.functional import perturbed_action, sample_action_latent
 
 if TYPE_CHECKING:
     from torchrl.objectives import LossModule
@@ -52,6 +53,9 @@ class BCQPolicy(TensorDictModuleBase):
         torch.Size([5, 2])
     """
 
+    action_low: Tensor
+    action_high: Tensor
+
     def __init__(
         self,
         decoder: TensorDictModule,
@@ -62,7 +66,7 @@ class BCQPolicy(TensorDictModuleBase):
         num_candidates: int = 100,
         latent_clip: float | None = 0.5,
         max_perturbation: float = 0.05,
-        bounds: tuple[float, float] = (-1.0, 1.0),
+        bounds: tuple[float | Tensor, float | Tensor] = (-1.0, 1.0),
     ) -> None:
         super().__init__()
         if num_candidates < 1:
@@ -74,7 +78,9 @@ class BCQPolicy(TensorDictModuleBase):
         self.num_candidates = num_candidates
         self.latent_clip = latent_clip
         self.max_perturbation = max_perturbation
-        self.bounds = bounds
+        low, high = (torch.as_tensor(bound) for bound in bounds)
+        self.register_buffer("action_low", low)
+        self.register_buffer("action_high", high)
         self.in_keys = [key for key in decoder.in_keys if key != "action_latent"]
         self.out_keys = ["action"]
 
@@ -117,7 +123,10 @@ class BCQPolicy(TensorDictModuleBase):
             proposals = self.perturbation_network(proposals)
             action, perturbation = proposals.get("action"), proposals.get("perturbation")
             proposals.set(
-                "action", perturbed_action(action, perturbation, self.max_perturbation, *self.bounds)
+                "action",
+                perturbed_action(
+                    action, perturbation, self.max_perturbation, self.action_low, self.action_high
+                ),
             )
         value = self.qvalue_network(proposals).get("state_action_value")
         best = value.argmax(dim=-2, keepdim=True)

@@ -33,8 +33,8 @@ def make_task_encoder(
 ) -> TensorDictModule:
     r"""Encoder :math:`M` of a transition :math:`(s, a, r, s')`.
 
-    Reads ``observation (*B, obs_dim)``, ``action (*B, action_dim)``, ``("next", "reward") (*B, 1)``,
-    ``("next", "observation")``; writes ``task_latent (*B, task_latent_dim)``.
+    Reads ``observation (*B, obs_dim)``, ``action (*B, action_dim)``, ``("next", "reward")
+    (*B, 1)``, ``("next", "observation")``; writes ``task_latent (*B, task_latent_dim)``.
 
     Reference: *Compositional Skill Learning Using Batch Meta RL*, section 6.2.
 
@@ -54,7 +54,9 @@ def make_task_classifier(num_tasks: int, task_latent_dim: int = 2) -> TensorDict
         ['task_logits']
     """
     return TensorDictModule(
-        torch.nn.Linear(task_latent_dim, num_tasks), in_keys=["task_latent"], out_keys=["task_logits"]
+        torch.nn.Linear(task_latent_dim, num_tasks),
+        in_keys=["task_latent"],
+        out_keys=["task_logits"],
     )
 
 
@@ -116,9 +118,7 @@ class PrototypeTaskLatent(Transform):
     ) -> TensorDictBase:
         return self.forward(tensordict_reset)
 
-    def _step(
-        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
-    ) -> TensorDictBase:
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.forward(next_tensordict)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -141,9 +141,7 @@ class OnlineTaskLatent(PrototypeTaskLatent):
         self.encoder = encoder
 
     @torch.no_grad()
-    def _step(
-        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
-    ) -> TensorDictBase:
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         transition = TensorDict(
             {
                 "observation": tensordict.get("observation"),
@@ -202,9 +200,7 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
         self._time = 0
         return self._aligned(tensordict_reset)
 
-    def _step(
-        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
-    ) -> TensorDictBase:
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._time += 1
         return self._aligned(next_tensordict)
 

@@ -21,7 +21,7 @@ from torchrl.objectives.utils import (
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.objectives.functional import (
+from torchrl_bmrl.functional import (
     bcq_next_value,
     gaussian_kl,
     perturbed_action,
@@ -228,9 +228,7 @@ class BCQLoss(LossModule):
             ("kl_weight", kl_weight),
             ("max_perturbation", max_perturbation),
         ):
-            self.register_coeff_buffer(
-                name, value, device=reference.device, dtype=reference.dtype
-            )
+            self.register_coeff_buffer(name, value, device=reference.device, dtype=reference.dtype)
         self.make_value_estimator(self.default_value_estimator)
         self._make_vmap()
 
@@ -361,6 +359,7 @@ class BCQLoss(LossModule):
         return proposal
 
     def _perturb(self, tensordict: TensorDictBase, params: TensorDictParams) -> TensorDictBase:
+        assert self.perturbation_network is not None  # callers have params only then
         keys = self.tensor_keys
         with params.to_module(self.perturbation_network, preserve_module_state=False):
             tensordict = self.perturbation_network(tensordict)
@@ -482,8 +481,7 @@ def _action_bounds(
     """Lower and upper bound of the action from exactly one of the two."""
     if (action_spec is None) == (bounds is None):
         raise BMRLError(
-            "give either action_spec or bounds; got "
-            + ("neither" if bounds is None else "both")
+            "give either action_spec or bounds; got " + ("neither" if bounds is None else "both")
         )
     if bounds is None:
         if isinstance(action_spec, Composite):

@@ -15,7 +15,7 @@ from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import _vmap_func
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.objectives.functional import (
+from torchrl_bmrl.functional import (
     direction_error,
     sample_action_latent,
     squared_error,
@@ -84,7 +84,11 @@ class MetaDistillationLoss(LossModule):
 
     Example:
         >>> from torchrl_bmrl.modules import (
-        ...     ActionVAE, make_decoder, make_qvalue_network, make_task_classifier, make_task_encoder
+        ...     ActionVAE,
+        ...     make_decoder,
+        ...     make_qvalue_network,
+        ...     make_task_classifier,
+        ...     make_task_encoder,
         ... )
         >>> loss = MetaDistillationLoss(
         ...     make_task_encoder(3, 2),
@@ -220,9 +224,7 @@ class MetaDistillationLoss(LossModule):
 
         reference = next(student_generator.parameters())
         zeros = torch.zeros(self.num_tasks, device=reference.device, dtype=reference.dtype)
-        self.register_buffer(
-            "qvalue_loc", zeros if qvalue_loc is None else qvalue_loc.to(zeros)
-        )
+        self.register_buffer("qvalue_loc", zeros if qvalue_loc is None else qvalue_loc.to(zeros))
         self.register_buffer(
             "qvalue_scale", zeros + 1 if qvalue_scale is None else qvalue_scale.to(zeros)
         )
@@ -234,9 +236,7 @@ class MetaDistillationLoss(LossModule):
             ("qvalue_weight", qvalue_weight),
             ("latent_norm_weight", latent_norm_weight),
         ):
-            self.register_coeff_buffer(
-                name, value, device=reference.device, dtype=reference.dtype
-            )
+            self.register_coeff_buffer(name, value, device=reference.device, dtype=reference.dtype)
         self._make_vmap()
 
     def _make_vmap(self) -> None:

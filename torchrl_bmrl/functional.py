@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F  # noqa: N812
+from torch.nn import functional as F
 
 
 def gaussian_kl(loc: Tensor, scale: Tensor) -> Tensor:
@@ -58,11 +58,18 @@ def sample_action_latent(
         (True, True)
     """
     latent = torch.randn(shape, device=device, dtype=dtype)
-    return latent if latent_clip is None else latent.clamp(-latent_clip, latent_clip)
+    if latent_clip is None:
+        return latent
+    bound = torch.as_tensor(latent_clip, device=device, dtype=dtype)
+    return latent.clamp(-bound, bound)
 
 
 def perturbed_action(
-    action: Tensor, perturbation: Tensor, max_perturbation: float | Tensor, low: Tensor, high: Tensor
+    action: Tensor,
+    perturbation: Tensor,
+    max_perturbation: float | Tensor,
+    low: Tensor,
+    high: Tensor,
 ) -> Tensor:
     r"""Action moved by the perturbation network within the action's bounds.
 
@@ -80,7 +87,7 @@ def perturbed_action(
         >>> perturbed_action(torch.tensor([0.98]), torch.tensor([1.0]), 0.05, low, high)
         tensor([1.])
     """
-    return torch.clamp(action + max_perturbation * perturbation, low, high)
+    return (action + max_perturbation * perturbation).clamp(low, high)
 
 
 def soft_clipped_value(state_action_value: Tensor, lmbda: float | Tensor) -> Tensor:
@@ -105,7 +112,7 @@ def soft_clipped_value(state_action_value: Tensor, lmbda: float | Tensor) -> Ten
 def bcq_next_value(state_action_value: Tensor, lmbda: float | Tensor) -> Tensor:
     r"""BCQ's value of a next state: the best candidate under the soft clipped double-Q.
 
-    .. math:: V(s') = \max_i \left[\lambda \min_j Q_j(s', a_i) + (1-\lambda) \max_j Q_j(s', a_i)\right]
+    .. math:: V(s') = \max_i [\lambda \min_j Q_j(s', a_i) + (1 - \lambda) \max_j Q_j(s', a_i)]
 
     Reference: BCQ, eq. 13; this project's paper, eqs. 1-2.
 
@@ -142,7 +149,9 @@ def squared_error(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def direction_error(prediction: Tensor, target: Tensor) -> Tensor:
-    r"""One minus the cosine of the angle, :math:`1 - \hat g \cdot g / (\lVert\hat g\rVert \lVert g\rVert)`.
+    r"""One minus the cosine of the angle between prediction and target.
+
+    .. math:: 1 - \frac{\hat g \cdot g}{\lVert\hat g\rVert \lVert g\rVert}
 
     Args:
         prediction: ``(*B, n)``.
