@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_bmrl.errors import CheckpointError
-from torchrl_bmrl.files import atomic_path
+from torchrl_bmrl.files import write_atomic
 
 _TENSOR, _PAIRS = "__tensor__", "__pairs__"
 
@@ -39,8 +39,7 @@ def save_checkpoint(path: Path, state: Mapping[str, Any], metadata: Mapping[str,
         "state": json.dumps(_encode(state, "", tensors)),
         "metadata": json.dumps(dict(metadata)),
     }
-    with atomic_path(path) as temporary:
-        safetensors.torch.save_file(tensors, temporary, header)
+    write_atomic(path, safetensors.torch.save(tensors, header))
 
 
 def load_checkpoint(path: Path, *, kind: str) -> tuple[dict[str, Any], dict[str, Any]]:

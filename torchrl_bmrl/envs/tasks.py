@@ -16,7 +16,7 @@ import gymnasium
 import mujoco
 import numpy as np
 
-from torchrl_bmrl.errors import UnknownNameError
+from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.names import PUSH_DIRECTIONS, TASKS, check_task
 
 # robosuite logs "no private macro file" and controller notes at import and at every construction.
@@ -453,9 +453,12 @@ class SawyerEnv(gymnasium.Env):
         """Acts for one control period (50 ms).
 
         Raises:
-            BMRLError: if the action is not finite.
+            BMRLError: if the action has another shape or is not finite; nothing has moved then.
         """
-        self.robosuite_env.step(np.asarray(action, dtype=np.float64))
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != self.action_space.shape or not np.isfinite(action).all():
+            raise BMRLError(f"action is {action}; valid: finite, of shape (7,)")
+        self.robosuite_env.step(action)
         terms = self.robosuite_env.reward_terms()
         observation = self.robosuite_env.named_observation()
         return observation, sum(terms.values()), False, False, self._info(terms)

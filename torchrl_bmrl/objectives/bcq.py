@@ -58,7 +58,7 @@ class BCQLoss(LossModule):
     Args:
         generator: a module with two :class:`~tensordict.nn.TensorDictModule` children: ``encoder``
             (observation, action → ``action_latent_loc``, ``action_latent_scale``) and ``decoder``
-            (observation, ``action_latent`` → action), such as
+            (observation, ``action_latent`` → action), and ``latent_dim``, the size of z, such as
             :class:`torchrl_bmrl.modules.ActionVAE`.
         qvalue_network: list of critics (observation, action → ``state_action_value``), each with
             an initialisation of its own.
@@ -74,8 +74,6 @@ class BCQLoss(LossModule):
         max_perturbation: φ. Default 0.05.
         loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"`` between value and target.
         gamma: discount of the default TD(0) estimator. Default 0.99.
-        separate_losses: if ``True``, parameters that the critics share with the generator get no
-            gradient from the critics' loss.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
         deactivate_vmap: run the critics in a loop and not under :func:`torch.vmap`.
         use_prioritized_weights: ``True``, ``False`` or ``"auto"``, as in TorchRL's losses.
@@ -174,7 +172,6 @@ class BCQLoss(LossModule):
         max_perturbation: float = 0.05,
         loss_function: str = "l2",
         gamma: float = 0.99,
-        separate_losses: bool = False,
         reduction: str = "mean",
         deactivate_vmap: bool = False,
         use_prioritized_weights: str | bool = "auto",
@@ -184,11 +181,12 @@ class BCQLoss(LossModule):
             raise BMRLError(f"num_candidates is {num_candidates}; valid: at least 1")
         if not 0.0 <= lmbda <= 1.0:
             raise BMRLError(f"lmbda is {lmbda}; valid: between 0 and 1")
-        for part in ("encoder", "decoder"):
+        for part in ("encoder", "decoder", "latent_dim"):
             if not hasattr(generator, part):
                 raise BMRLError(
                     f"generator {type(generator).__name__} has no {part!r}; valid: a module with "
-                    "'encoder' and 'decoder', such as torchrl_bmrl.modules.ActionVAE"
+                    "'encoder', 'decoder' and 'latent_dim', such as "
+                    "torchrl_bmrl.modules.ActionVAE"
                 )
         if not isinstance(qvalue_network, (list, tuple)):
             raise BMRLError(
@@ -210,7 +208,6 @@ class BCQLoss(LossModule):
             "qvalue_network",
             expand_dim=self.num_qvalue_nets,
             create_target_params=True,
-            compare_against=list(generator.parameters()) if separate_losses else None,
         )
         if perturbation_network is None:
             self.perturbation_network = None
@@ -343,10 +340,8 @@ class BCQLoss(LossModule):
     ) -> TensorDictBase:
         """Adds to each row an action decoded from a random latent, perturbed with ``params``."""
         keys = self.tensor_keys
-        # The decoder's last layer is not known here; the encoder's posterior has z's width.
-        latent_dim = self.generator.latent_dim
         latent = sample_action_latent(
-            (*observation.batch_size, latent_dim),
+            (*observation.batch_size, self.generator.latent_dim),
             latent_clip=self.latent_clip,
             device=self.action_low.device,
             dtype=self.action_low.dtype,
