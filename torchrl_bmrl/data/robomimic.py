@@ -138,13 +138,38 @@ def write_demonstrations(
         file["mask/valid"] = np.array(names[train_episodes:], dtype="S")
 
 
+_DAMAGE = (OSError, RuntimeError, KeyError, TypeError, ValueError, MemoryError)
+"""What h5py raises on a damaged file, depending on where the damage is."""
+
+
 def _open(path: Path) -> h5py.File:
     if not Path(path).is_file():
         raise DataError(path, None, "no such file; recipes/collect.py writes it")
     try:
         return h5py.File(path, "r")
-    except OSError as error:
+    except _DAMAGE as error:
         raise DataError(path, None, f"not a whole HDF5 file ({error})") from error
+
+
+def _names(path: Path, file: h5py.File) -> list[str]:
+    """Names of all demonstrations, ``demo_2`` before ``demo_10``."""
+    try:
+        data = file.get("data")
+        if isinstance(data, h5py.Group):
+            return sorted(data, key=lambda name: (len(name), name))
+    except _DAMAGE as error:
+        raise DataError(path, "data", f"unreadable ({error})") from error
+    raise DataError(path, "data", "missing; valid: a group that holds every demonstration")
+
+
+def _array(path: Path, file: h5py.File, key: str) -> np.ndarray:
+    try:
+        node = file.get(key)
+        if isinstance(node, h5py.Dataset):
+            return np.asarray(node[()])
+    except _DAMAGE as error:
+        raise DataError(path, key, f"unreadable ({error})") from error
+    raise DataError(path, key, "missing" if node is None else "a group; valid: a dataset")
 
 
 def count_episodes(path: Path) -> int:
@@ -154,9 +179,7 @@ def count_episodes(path: Path) -> int:
         DataError: if the file is missing, damaged or has no ``data`` group.
     """
     with _open(path) as file:
-        if "data" not in file:
-            raise DataError(path, "data", "missing; every demonstration lies under it")
-        return len(file["data"])
+        return len(_names(path, file))
 
 
 def read_demonstrations(
@@ -178,36 +201,23 @@ def read_demonstrations(
             shapes, values that are not finite, or actions outside [-1, 1].
     """
     observation_keys = list(observation_keys)
+    wanted = ["actions", "rewards", "successes"]
+    wanted += [f"{group}/{part}" for group in ("obs", "next_obs") for part in observation_keys]
     with _open(path) as file:
-        if "data" not in file:
-            raise DataError(path, "data", "missing; every demonstration lies under it")
-        names = sorted(file["data"], key=lambda name: (len(name), name))
+        names = _names(path, file)
         if split is not None:
             key = f"mask/{split}"
-            if key not in file:
-                raise DataError(path, key, "missing; it names the demonstrations of the split")
-            chosen = [name.decode() for name in file[key][:]]
+            mask = _array(path, file, key).reshape(-1)
+            chosen = [x.decode(errors="replace") if isinstance(x, bytes) else str(x) for x in mask]
             unknown = sorted(set(chosen) - set(names))
             if unknown:
                 raise DataError(path, key, f"names {unknown[0]!r}, which is not in the file")
             names = chosen
         if not names:
-            raise DataError(path, "data", f"no demonstrations in split {split!r}")
+            raise DataError(path, f"mask/{split}" if split else "data", "no demonstrations")
         episodes = []
         for name in names:
-            demo = file["data"][name]
-            arrays: dict[str, np.ndarray] = {}
-            wanted = ["actions", "rewards", "successes"]
-            wanted += [
-                f"{group}/{part}" for group in ("obs", "next_obs") for part in observation_keys
-            ]
-            for key in wanted:
-                if key not in demo:
-                    raise DataError(path, f"data/{name}/{key}", "missing")
-                try:
-                    arrays[key] = demo[key][:]
-                except OSError as error:
-                    raise DataError(path, f"data/{name}/{key}", f"unreadable ({error})") from error
+            arrays = {key: _array(path, file, f"data/{name}/{key}") for key in wanted}
             check_episode(path, f"data/{name}", arrays)
             episodes.append(
                 {

@@ -41,12 +41,14 @@ def check_episode(path: Path, demo: str, arrays: Mapping[str, np.ndarray]) -> No
         ...
         torchrl_bmrl.errors.DataError: a.hdf5: data/demo_0/actions: 2.0 in row 0 is outside [-1, 1]
     """
-    steps = len(arrays["actions"])
+    actions = arrays["actions"]
+    steps = len(actions) if actions.ndim else 0
     if steps == 0:
-        raise DataError(path, f"{demo}/actions", "no steps; valid: at least one")
+        message = f"shape {actions.shape}; valid: (T, {ACTION_DIM}) with at least one step"
+        raise DataError(path, f"{demo}/actions", message)
     for key, array in arrays.items():
         name = f"{demo}/{key}"
-        if not (np.issubdtype(array.dtype, np.number) or array.dtype == bool):
+        if array.dtype.kind not in "biuf":
             raise DataError(path, name, f"dtype {array.dtype}; valid: numbers")
         part = key.rsplit("/", 1)[-1]
         expected: tuple[int, ...] = (steps,)
@@ -63,7 +65,6 @@ def check_episode(path: Path, demo: str, arrays: Mapping[str, np.ndarray]) -> No
         if not finite.all():
             row = int(np.argwhere(~finite)[0][0])
             raise DataError(path, name, f"a value that is not finite in row {row}")
-    actions = arrays["actions"]
     outside = np.argwhere(np.abs(actions) > 1 + ACTION_TOLERANCE)
     if len(outside):
         row, column = outside[0]

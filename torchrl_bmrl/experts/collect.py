@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -151,9 +152,8 @@ def collect_demonstrations(
             env_args=robosuite_metadata(task),
             attributes={"task": task, "action_noise": noise, "seed": seed},
         )
-        for path in paths:
-            path.unlink()
-        paths[0].parent.rmdir()
+        # Whole: a killed process may have left temporary files there.
+        shutil.rmtree(paths[0].parent)
     for task, path in files.items():
         if count_episodes(path) != counts[task]:
             raise DataError(

@@ -6,7 +6,7 @@ from copy import deepcopy
 from typing import TYPE_CHECKING
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 
@@ -138,5 +138,7 @@ class BCQPolicy(TensorDictModuleBase):
 def _instantiate(module: TensorDictModule, params: TensorDictBase) -> TensorDictModule:
     """A stand-alone copy of a functional module that holds the given parameters."""
     module = deepcopy(module)
-    params.data.clone().to_module(module, preserve_module_state=False)
+    # As parameters: plain tensors would act, but be missing from parameters() and state_dict().
+    own = TensorDictParams(params.data.clone())
+    own.to_module(module, preserve_module_state=False)
     return module.requires_grad_(False)

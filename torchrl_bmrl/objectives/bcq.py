@@ -20,7 +20,7 @@ from torchrl.objectives.utils import (
 )
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.functional import (
     bcq_next_value,
     gaussian_kl,
@@ -28,6 +28,9 @@ from torchrl_bmrl.functional import (
     sample_action_latent,
     squared_error,
 )
+
+LOSS_FUNCTIONS = ("l2", "l1", "smooth_l1")
+REDUCTIONS = ("mean", "sum", "none")
 
 
 class BCQLoss(LossModule):
@@ -83,8 +86,9 @@ class BCQLoss(LossModule):
     Key written to the input: ``td_error (*B,)``, the priority.
 
     Raises:
-        BMRLError: for candidates below one, λ outside [0, 1], a generator without encoder and
-            decoder, or bounds and spec given together or not at all.
+        BMRLError: for candidates below one, λ outside [0, 1], a generator without encoder,
+            decoder and ``latent_dim``, critics that are not a list, an unknown ``loss_function`` or
+            ``reduction``, or bounds and spec given together or not at all.
 
     Example:
         >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
@@ -188,11 +192,16 @@ class BCQLoss(LossModule):
                     "'encoder', 'decoder' and 'latent_dim', such as "
                     "torchrl_bmrl.modules.ActionVAE"
                 )
-        if not isinstance(qvalue_network, (list, tuple)):
+        if not isinstance(qvalue_network, (list, tuple)) or not qvalue_network:
+            given = type(qvalue_network).__name__
             raise BMRLError(
-                f"qvalue_network is a {type(qvalue_network).__name__}; valid: a list of critics, "
-                "each with an initialisation of its own"
+                f"qvalue_network is {'an empty' if not qvalue_network else 'a'} {given}; valid: a "
+                "list of critics, each with an initialisation of its own"
             )
+        if loss_function not in LOSS_FUNCTIONS:
+            raise UnknownNameError("loss_function", loss_function, LOSS_FUNCTIONS)
+        if reduction not in REDUCTIONS:
+            raise UnknownNameError("reduction", reduction, REDUCTIONS)
         self._in_keys: list[NestedKey] | None = None
         self.num_candidates = num_candidates
         self.num_qvalue_nets = len(qvalue_network)
@@ -259,7 +268,9 @@ class BCQLoss(LossModule):
         if isinstance(value_type, ValueEstimatorBase) or (
             isinstance(value_type, type) and issubclass(value_type, ValueEstimatorBase)
         ):
-            return LossModule.make_value_estimator(self, value_type, **hyperparams)
+            LossModule.make_value_estimator(self, value_type, **hyperparams)
+            self._forward_value_estimator_keys()
+            return self
         # No value network: qvalue_loss writes the next value into the data.
         dispatch_value_estimator(
             self,

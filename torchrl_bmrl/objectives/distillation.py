@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict import TensorDict, TensorDictBase, TensorDictParams, unravel_key
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import _vmap_func
 
-from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.functional import (
     direction_error,
     sample_action_latent,
@@ -79,8 +79,9 @@ class MetaDistillationLoss(LossModule):
     same transition keys under ``"previous"``. Nothing is written to the input.
 
     Raises:
-        BMRLError: for numbers of teachers that differ, an unknown context, or data whose first
-            dimension is not the number of teachers.
+        BMRLError: for numbers of teachers that differ, an unknown context or a share or size of it
+            out of range, data whose first dimension is not the number of teachers, or data without
+            ``"previous"`` where the context needs it.
 
     Example:
         >>> from torchrl_bmrl.modules import (
@@ -196,7 +197,11 @@ class MetaDistillationLoss(LossModule):
                 "teacher_qvalue_networks; valid: one of each per task"
             )
         if context not in CONTEXTS:
-            raise BMRLError(f"unknown context {context!r}; valid: {', '.join(CONTEXTS)}")
+            raise UnknownNameError("context", context, CONTEXTS)
+        if not 0.0 <= context_fraction <= 1.0:
+            raise BMRLError(f"context_fraction is {context_fraction}; valid: between 0 and 1")
+        if context_size < 1:
+            raise BMRLError(f"context_size is {context_size}; valid: at least 1")
         self._in_keys: list[NestedKey] | None = None
         self.num_tasks = len(teacher_generators)
         self.latent_dim = latent_dim
@@ -261,10 +266,7 @@ class MetaDistillationLoss(LossModule):
             keys.append(self.tensor_keys.task)
             if self.context == "previous":
                 previous = self.tensor_keys.previous
-                keys += [
-                    (previous, *((key,) if isinstance(key, str) else key))
-                    for key in self.task_encoder.in_keys
-                ]
+                keys += [unravel_key((previous, key)) for key in self.task_encoder.in_keys]
             self._in_keys = list(dict.fromkeys(keys))
         return self._in_keys
 
@@ -287,7 +289,14 @@ class MetaDistillationLoss(LossModule):
         if self.context == "current":
             return latent
         if self.context == "previous":
-            other = self._encode(tensordict.get(self.tensor_keys.previous).select(*keys))
+            previous = tensordict.get(self.tensor_keys.previous, None)
+            if previous is None:
+                raise BMRLError(
+                    f"the data have no {self.tensor_keys.previous!r}, which context='previous' "
+                    "reads; valid: data of torchrl_bmrl.data.with_previous, or another context: "
+                    + ", ".join(name for name in CONTEXTS if name != "previous")
+                )
+            other = self._encode(previous.select(*keys))
         else:
             # Rows of a task are draws from its data: others of the same row are its context.
             size = self.context_size if self.context == "set" else 1

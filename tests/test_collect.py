@@ -1,0 +1,217 @@
+"""Collections do not depend on the number of workers, and lose no finished episode."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("robosuite", exc_type=ImportError)
+pytest.importorskip("h5py")
+
+import h5py
+
+from torchrl_bmrl.data.robomimic import read_demonstrations, read_episode
+from torchrl_bmrl.data.schema import OBSERVATION_SHAPES
+from torchrl_bmrl.errors import DataError, UnknownNameError
+from torchrl_bmrl.experts import collect
+from torchrl_bmrl.experts.collect import collect_demonstrations, collect_episode
+from torchrl_bmrl.experts.controllers import ExpertGains
+
+pytestmark = pytest.mark.robosuite
+
+EPISODES = {"reach": 2, "lift": 1}
+HORIZON = 10
+
+
+class Killed(BaseException):
+    """Like a signal: no ``except Exception`` stops it."""
+
+
+@pytest.fixture(autouse=True)
+def _short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collect, "HORIZON", HORIZON)
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Path]]:
+    """A collection by one worker."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(collect, "HORIZON", HORIZON)
+        yield run(tmp_path_factory.mktemp("collected"))
+
+
+def run(
+    directory: Path,
+    episodes: dict[str, int] = EPISODES,
+    *,
+    seed: int = 3,
+    workers: int = 1,
+) -> dict[str, Path]:
+    return collect_demonstrations(
+        directory, episodes, valid_episodes=1, noise=0.2, seed=seed, workers=workers
+    )
+
+
+def files(directory: Path) -> list[str]:
+    return sorted(str(p.relative_to(directory)) for p in directory.rglob("*") if p.is_file())
+
+
+def test_a_collection_is_one_file_per_task(collected: dict[str, Path]) -> None:
+    directory = collected["reach"].parent
+    assert collected == {task: directory / f"{task}.hdf5" for task in EPISODES}
+    assert files(directory) == ["lift.hdf5", "reach.hdf5"]
+
+
+def test_the_file_has_the_layout_of_robomimic(collected: dict[str, Path]) -> None:
+    for task, train in EPISODES.items():
+        with h5py.File(collected[task]) as file:
+            data = file["data"]
+            names = [f"demo_{i}" for i in range(train + 1)]
+            assert sorted(data) == names
+            assert data.attrs["total"] == (train + 1) * HORIZON
+            env_args = json.loads(data.attrs["env_args"])
+            assert env_args["type"] == 1
+            assert env_args["env_name"] == f"BMRLSawyer{task.title()}"
+            assert env_args["env_kwargs"]["robots"] == "Sawyer"
+            assert (data.attrs["task"], data.attrs["seed"]) == (task, 3)
+            assert data.attrs["action_noise"] == 0.2
+            for name in names:
+                demo = data[name]
+                assert demo.attrs["num_samples"] == HORIZON
+                assert demo["actions"].shape == (HORIZON, 7)
+                assert np.abs(demo["actions"][:]).max() <= 1
+                assert demo["states"].shape[0] == HORIZON
+                assert demo["dones"][:].tolist() == [0] * (HORIZON - 1) + [1]
+                for part, size in OBSERVATION_SHAPES.items():
+                    assert demo[f"obs/{part}"].shape == (HORIZON, size)
+                    np.testing.assert_array_equal(
+                        demo[f"next_obs/{part}"][:-1], demo[f"obs/{part}"][1:]
+                    )
+            assert file["mask/train"][:].tolist() == [n.encode() for n in names[:train]]
+            assert file["mask/valid"][:].tolist() == [names[train].encode()]
+
+
+def test_the_episodes_start_differently(collected: dict[str, Path]) -> None:
+    goals = [demo["obs"]["goal_pos"][0] for demo in read_demonstrations(collected["reach"])]
+    assert len(np.unique(np.round(goals, 6), axis=0)) == 3
+
+
+def test_a_stored_seed_reproduces_its_episode(collected: dict[str, Path]) -> None:
+    with h5py.File(collected["lift"]) as file:
+        demo = file["data/demo_1"]
+        again = collect_episode("lift", int(demo.attrs["seed"]), noise=0.2, gains=ExpertGains())
+        np.testing.assert_array_equal(again.actions, demo["actions"][:])
+        np.testing.assert_array_equal(again.states[:-1], demo["states"][:])
+        np.testing.assert_array_equal(again.rewards, demo["rewards"][:])
+
+
+def test_two_workers_write_the_same_bytes_as_one(
+    tmp_path: Path, collected: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Worker processes import the package afresh: there, too, the episodes must be short.
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "patch"), prepend=os.pathsep)
+    (tmp_path / "patch").mkdir()
+    (tmp_path / "patch" / "sitecustomize.py").write_text(
+        f"import torchrl_bmrl.names\ntorchrl_bmrl.names.HORIZON = {HORIZON}\n"
+    )
+    again = run(tmp_path / "two", workers=2)
+    for task, path in collected.items():
+        assert again[task].read_bytes() == path.read_bytes()
+
+
+def test_episodes_do_not_depend_on_how_many_are_asked_for(
+    tmp_path: Path, collected: dict[str, Path]
+) -> None:
+    more = run(tmp_path, {"reach": 4})
+    first, longer = (read_demonstrations(path) for path in (collected["reach"], more["reach"]))
+    for ours, theirs in zip(first, longer, strict=False):
+        np.testing.assert_array_equal(ours["actions"], theirs["actions"])
+    assert len(longer) == 5
+
+
+def test_another_seed_gives_other_episodes(tmp_path: Path, collected: dict[str, Path]) -> None:
+    other = run(tmp_path, {"lift": 1}, seed=4)["lift"]
+    ours, theirs = (read_demonstrations(path)[0] for path in (collected["lift"], other))
+    assert not np.array_equal(ours["actions"], theirs["actions"])
+
+
+def test_what_was_finished_before_a_kill_is_kept_and_not_redone(
+    tmp_path: Path, collected: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, calls = collect.collect_episode, []
+
+    def killed_at_the_fourth(task: str, seed: int, **options: object) -> object:
+        if len(calls) == 3:
+            raise Killed
+        calls.append((task, seed))
+        return real(task, seed, **options)
+
+    monkeypatch.setattr(collect, "collect_episode", killed_at_the_fourth)
+    with pytest.raises(Killed):
+        run(tmp_path)
+    kept = files(tmp_path)
+    assert kept == [f".episodes/reach/0000{i}.npz" for i in range(3)]
+    for name in kept:
+        assert len(read_episode(tmp_path / name).actions) == HORIZON
+    times = {name: (tmp_path / name).stat().st_mtime_ns for name in kept}
+    (tmp_path / ".episodes" / "reach" / ".00003.npz.0123.tmp").write_text("half of an epis")
+
+    redone = []
+
+    def counted(task: str, seed: int, **options: object) -> object:
+        assert times == {name: (tmp_path / name).stat().st_mtime_ns for name in kept}
+        redone.append((task, seed))
+        return real(task, seed, **options)
+
+    monkeypatch.setattr(collect, "collect_episode", counted)
+    again = run(tmp_path)
+    assert [task for task, _ in redone] == ["lift", "lift"]
+    assert not set(redone) & set(calls)
+    assert files(tmp_path) == ["lift.hdf5", "reach.hdf5"]
+    for task, path in collected.items():
+        assert again[task].read_bytes() == path.read_bytes()
+
+
+def test_a_complete_collection_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = run(tmp_path, {"lift": 1})["lift"]
+    before = (first.stat().st_mtime_ns, first.read_bytes())
+    monkeypatch.setattr(collect, "collect_episode", None)  # whoever calls it fails
+    assert run(tmp_path, {"lift": 1}) == {"lift": first}
+    assert (first.stat().st_mtime_ns, first.read_bytes()) == before
+
+
+def test_a_file_with_another_number_of_episodes_is_refused(collected: dict[str, Path]) -> None:
+    before = collected["reach"].read_bytes()
+    with pytest.raises(DataError) as caught:
+        run(collected["reach"].parent, {"reach": 4})
+    assert caught.value.path == collected["reach"]
+    assert "holds 3 episodes where 5 are asked for" in str(caught.value)
+    assert collected["reach"].read_bytes() == before
+
+
+def test_fewer_episodes_than_a_killed_run_had_finished_are_enough(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = collect.write_demonstrations
+
+    def killed(*args: object, **options: object) -> None:
+        raise Killed
+
+    monkeypatch.setattr(collect, "write_demonstrations", killed)
+    with pytest.raises(Killed):
+        run(tmp_path, {"lift": 2})
+    monkeypatch.setattr(collect, "write_demonstrations", real)
+    assert len(read_demonstrations(run(tmp_path, {"lift": 1})["lift"])) == 2
+
+
+def test_an_unknown_task_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match=r"'lfit'.*reach, lift"):
+        run(tmp_path, {"reach": 1, "lfit": 1})
+    assert files(tmp_path) == []

@@ -1,0 +1,147 @@
+"""Scripted experts solve their tasks within their limits, and say which phase they are in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+pytest.importorskip("robosuite", exc_type=ImportError)
+
+from torchrl_bmrl.envs.tasks import SawyerEnv
+from torchrl_bmrl.errors import UnknownNameError
+from torchrl_bmrl.experts.collect import collect_episode
+from torchrl_bmrl.experts.controllers import ExpertGains, make_expert
+from torchrl_bmrl.names import TASKS
+
+pytestmark = pytest.mark.robosuite
+
+PHASES = {
+    "reach": ("reach",),
+    "lift": ("descend", "grasp", "lift"),
+    **dict.fromkeys([t for t in TASKS if "push" in t], ("approach", "contact", "push")),
+}
+
+
+@pytest.fixture(scope="module")
+def envs() -> Iterator[dict[str, SawyerEnv]]:
+    made = {task: SawyerEnv(task) for task in TASKS}
+    yield made
+    for env in made.values():
+        env.close()
+
+
+def act(
+    env: SawyerEnv, seed: int, *, gains: ExpertGains | None = None, steps: int = 200
+) -> tuple[np.ndarray, list[int], bool]:
+    """Actions, phases and success of an expert without noise, up to its success."""
+    env.reset(seed=seed)
+    expert = make_expert(env.task, env.robosuite_env, gains)
+    actions, phases = [], []
+    for _ in range(steps):
+        actions.append(expert())
+        phases.append(expert.phase)
+        *_, info = env.step(actions[-1].astype(np.float32))
+        if info["success"]:
+            return np.array(actions), phases, True
+    return np.array(actions), phases, False
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("task", TASKS)
+def test_an_expert_solves_its_task_phase_by_phase_within_the_action_space(
+    envs: dict[str, SawyerEnv], task: str, seed: int
+) -> None:
+    actions, phases, solved = act(envs[task], seed)
+    assert solved
+    assert actions.shape[1] == 7
+    assert np.abs(actions).max() <= 1.0
+    assert make_expert(task, envs[task].robosuite_env).phases == PHASES[task]
+    # Without noise nothing is dropped or slips away: every phase once, in order.
+    assert list(dict.fromkeys(phases)) == list(range(len(PHASES[task])))
+    assert (np.diff(phases) >= 0).all()
+
+
+def test_the_gripper_follows_the_phases(envs: dict[str, SawyerEnv]) -> None:
+    actions, phases, _ = act(envs["lift"], 0)
+    commands = {phase: set(actions[np.array(phases) == phase, 6]) for phase in (0, 1, 2)}
+    assert commands[0] == {-1.0}
+    assert commands[2] == {1.0}
+    # The action that notices the start of the grasp still holds the fingers open.
+    grasp = actions[np.array(phases) == 1, 6]
+    assert (grasp[1:] == 1.0).all()
+    assert (act(envs["push_up"], 0, steps=10)[0][:, 6] == 1.0).all()
+    assert (act(envs["reach"], 0, steps=10)[0][:, 6] == -1.0).all()
+
+
+def test_free_motion_respects_the_speed_limit(envs: dict[str, SawyerEnv]) -> None:
+    for task in ("reach", "lift"):
+        actions, _, _ = act(envs[task], 2, gains=ExpertGains(speed_limit=0.3), steps=25)
+        assert np.abs(actions[:, :3]).max() == pytest.approx(0.3)
+        fast, _, _ = act(envs[task], 2, steps=25)
+        assert np.abs(fast[:, :3]).max() > 0.9
+
+
+def test_pushing_has_a_speed_limit_of_its_own(envs: dict[str, SawyerEnv]) -> None:
+    gains = ExpertGains(speed_limit=0.9, push_speed_limit=0.4)
+    actions, phases, _ = act(envs["push_up"], 0, gains=gains)
+    pushing = np.array(phases) == 2
+    assert pushing.any()
+    assert np.abs(actions[pushing, :3]).max() == pytest.approx(0.4)
+    assert np.abs(actions[~pushing, :3]).max() == pytest.approx(0.9)
+
+
+@pytest.mark.parametrize("task", ["lift", "push_left"])
+def test_an_expert_starts_over_after_reset(envs: dict[str, SawyerEnv], task: str) -> None:
+    env = envs[task]
+    first, _, _ = act(env, 3, steps=40)
+    env.reset(seed=4)
+    expert = make_expert(task, env.robosuite_env)
+    for _ in range(35):
+        env.step(expert().astype(np.float32))
+    assert expert.phase > 0
+    env.reset(seed=3)
+    expert.reset()
+    assert expert.phase == 0
+    again = []
+    for _ in range(len(first)):
+        again.append(expert())
+        env.step(again[-1].astype(np.float32))
+    np.testing.assert_array_equal(again, first)
+
+
+def test_a_seed_reproduces_an_episode_with_its_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchrl_bmrl.experts.collect.HORIZON", 25)
+    gains = ExpertGains()
+    first = collect_episode("lift", 5, noise=0.3, gains=gains)
+    other = collect_episode("lift", 6, noise=0.3, gains=gains)
+    again = collect_episode("lift", 5, noise=0.3, gains=gains)
+    for name in ("actions", "rewards", "successes", "phases", "states"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
+    for name, part in first.observations.items():
+        np.testing.assert_array_equal(again.observations[name], part)
+    assert not np.array_equal(other.actions, first.actions)
+
+
+def test_noise_is_gaussian_of_the_size_asked_for_on_every_dimension(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("torchrl_bmrl.experts.collect.HORIZON", 60)
+    # Slow, so that clipping to [-1, 1] leaves the noise as it was drawn.
+    gains = ExpertGains(speed_limit=0.05)
+    noisy = collect_episode("reach", 0, noise=0.2, gains=gains)
+    assert noisy.actions.dtype == np.float32
+    assert np.abs(noisy.actions).max() <= 1.0
+    deviation = noisy.actions[:, :6].std(axis=0)
+    assert (deviation > 0.12).all()
+    assert (deviation < 0.3).all()
+    assert noisy.actions[:, 6].std() > 0.05  # around -1, half of it clipped
+    still = collect_episode("reach", 0, noise=0.0, gains=gains)
+    assert np.abs(still.actions[:, :3]).max() <= 0.05 + 1e-6
+    assert set(still.actions[:, 6]) == {-1.0}
+
+
+def test_an_unknown_task_is_answered_with_the_valid_ones(envs: dict[str, SawyerEnv]) -> None:
+    with pytest.raises(UnknownNameError, match=r"'pull'.*reach, lift, push_right"):
+        make_expert("pull", envs["reach"].robosuite_env)

@@ -1,0 +1,510 @@
+"""Networks, the acting policy, and where the task embedding comes from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers import (
+    ACTION_DIM,
+    CELLS,
+    LATENT_DIM,
+    NO_UPDATER,
+    OBSERVATION_DIM,
+    TASK_LATENT_DIM,
+    make_bcq_loss,
+    numpy_mlp,
+    recorded,
+    transitions,
+)
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.transforms import Transform
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.modules import (
+    ActionVAE,
+    BCQPolicy,
+    DemonstrationTaskLatent,
+    OnlineTaskLatent,
+    PrototypeTaskLatent,
+    make_decoder,
+    make_perturbation_network,
+    make_qvalue_network,
+    make_task_classifier,
+    make_task_encoder,
+    prototype,
+)
+
+DIMS = (OBSERVATION_DIM, ACTION_DIM)
+
+
+def observations(*batch: int) -> TensorDict:
+    generator = torch.Generator().manual_seed(0)
+    return TensorDict(
+        {"observation": torch.randn(*batch, OBSERVATION_DIM, generator=generator)}, batch_size=batch
+    )
+
+
+# -- the generator -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 4)])
+@pytest.mark.parametrize("latent_dim", [None, 3])
+def test_encoder_and_decoder_have_the_shapes_that_they_say(
+    batch: tuple[int, ...], latent_dim: int | None
+) -> None:
+    generator = ActionVAE(*DIMS, latent_dim=latent_dim, num_cells=CELLS)
+    size = latent_dim or 2 * ACTION_DIM
+    assert generator.latent_dim == size
+    data = observations(*batch).set("action", torch.zeros(*batch, ACTION_DIM))
+    data = generator.encoder(data)
+    assert data["action_latent_loc"].shape == data["action_latent_scale"].shape == (*batch, size)
+    data["action_latent"] = data["action_latent_loc"]
+    assert generator.decoder(data)["action"].shape == (*batch, ACTION_DIM)
+
+
+@pytest.mark.parametrize(("bias", "expected"), [(-100.0, np.exp(-4)), (100.0, np.exp(15))])
+def test_log_deviation_is_clamped_as_published(bias: float, expected: float) -> None:
+    generator = ActionVAE(*DIMS, num_cells=CELLS)
+    generator.encoder.module.network[-1].bias.data[LATENT_DIM:] = bias
+    data = observations(5).set("action", torch.zeros(5, ACTION_DIM))
+    scale = generator.encoder(data)["action_latent_scale"]
+    assert scale.numpy(force=True) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("bounds", [(-1.0, 1.0), (-2.0, 0.5)])
+def test_decoded_actions_fill_the_bounds_and_never_leave_them(bounds: tuple[float, float]) -> None:
+    torch.manual_seed(0)
+    decoder = make_decoder(*DIMS, LATENT_DIM, num_cells=CELLS, bounds=bounds)
+    for parameter in decoder.parameters():
+        parameter.data.mul_(20.0)
+    data = observations(500).set("action_latent", torch.randn(500, LATENT_DIM))
+    action = decoder(data)["action"]
+    assert (action >= bounds[0]).all()
+    assert (action <= bounds[1]).all()
+    assert action.min() < bounds[0] + 0.01
+    assert action.max() > bounds[1] - 0.01
+    for parameter in decoder.parameters():
+        parameter.data.zero_()
+    assert decoder(data)["action"].unique().item() == sum(bounds) / 2
+
+
+def test_generator_proposes_a_fresh_action_for_every_row_unless_the_latent_is_given() -> None:
+    generator = ActionVAE(*DIMS, num_cells=CELLS)
+    same = TensorDict({"observation": torch.zeros(5, OBSERVATION_DIM)}, [5])
+    proposed = generator(same.clone())
+    assert len(proposed["action"].unique(dim=0)) == 5
+    given = same.clone().set("action_latent", proposed["action_latent"].clone())
+    assert torch.equal(generator(given)["action"], proposed["action"])
+
+
+@pytest.mark.parametrize("task_latent_dim", [0, 2])
+def test_every_input_reaches_decoder_and_critic(task_latent_dim: int) -> None:
+    torch.manual_seed(0)
+    modules = [
+        make_decoder(*DIMS, LATENT_DIM, task_latent_dim=task_latent_dim),
+        make_qvalue_network(*DIMS, task_latent_dim=task_latent_dim),
+        make_perturbation_network(*DIMS),
+        make_task_encoder(*DIMS),
+    ]
+    for module in modules:
+        data = transitions(4, dtype=torch.float32)
+        data["action_latent"] = torch.randn(4, LATENT_DIM)
+        data["task_latent"] = torch.randn(4, TASK_LATENT_DIM)
+        inputs = [data[key].requires_grad_() for key in module.in_keys]
+        assert ("task_latent" in module.in_keys) == (task_latent_dim > 0 and module in modules[:2])
+        module(data)[module.out_keys[0]].sum().backward()
+        assert all(x.grad.any() for x in inputs)
+
+
+def test_perturbation_is_as_wide_as_the_action_and_bounded() -> None:
+    torch.manual_seed(0)
+    network = make_perturbation_network(*DIMS, num_cells=CELLS)
+    for parameter in network.parameters():
+        parameter.data.mul_(20.0)
+    data = observations(500).set("action", torch.randn(500, ACTION_DIM))
+    perturbation = network(data)["perturbation"]
+    assert perturbation.shape == (500, ACTION_DIM)
+    assert (perturbation[:, 0] != perturbation[:, 1]).any()
+    assert 0.99 < perturbation.abs().max() <= 1.0
+
+
+# -- the policy --------------------------------------------------------------------------------
+
+
+class Near(nn.Module):
+    """A critic that prefers actions near a point."""
+
+    def __init__(self, point: Tensor) -> None:
+        super().__init__()
+        self.point = point
+
+    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
+        return -(action - self.point).square().sum(-1, keepdim=True)
+
+
+def near(point: float = 0.0) -> TensorDictModule:
+    return TensorDictModule(
+        Near(torch.full((ACTION_DIM,), point)),
+        in_keys=["observation", "action"],
+        out_keys=["state_action_value"],
+    )
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 4)])
+@pytest.mark.parametrize("num_candidates", [1, 20])
+def test_policy_takes_the_best_of_exactly_so_many_candidates(
+    batch: tuple[int, ...], num_candidates: int
+) -> None:
+    torch.manual_seed(0)
+    generator, critic = ActionVAE(*DIMS, num_cells=CELLS), near()
+    policy = BCQPolicy(
+        generator.decoder,
+        critic,
+        latent_dim=LATENT_DIM,
+        num_candidates=num_candidates,
+        latent_clip=None,
+    )
+    calls = recorded(generator.decoder.module)
+    data = observations(*batch)
+    action = policy(data)["action"]
+    ((observation, latent), candidates), *others = calls
+    assert not others
+    assert candidates.shape == (*batch, num_candidates, ACTION_DIM)
+    assert torch.equal(observation, data["observation"].unsqueeze(-2).expand(observation.shape))
+    assert len(latent.flatten(0, -2).unique(dim=0)) == latent[..., 0].numel()
+    best = candidates.square().sum(-1).argmin(-1)
+    for index in np.ndindex(*batch):
+        assert torch.equal(action[index], candidates[index][best[index]])
+    assert set(data.keys()) == {"observation", "action"}
+
+
+@pytest.mark.parametrize("clip", [0.5, None])
+def test_policy_clips_the_latent_only_if_asked(clip: float | None) -> None:
+    generator = ActionVAE(*DIMS, num_cells=CELLS)
+    policy = BCQPolicy(generator.decoder, near(), latent_dim=LATENT_DIM, latent_clip=clip)
+    calls = recorded(generator.decoder.module)
+    policy(observations(5))
+    assert calls[0][1].shape == (5, 100, ACTION_DIM)
+    largest = calls[0][0][1].abs().max()
+    assert largest > 2 if clip is None else largest == 0.5
+
+
+def test_policy_perturbs_the_candidates_within_the_bounds_before_it_judges_them() -> None:
+    generator = ActionVAE(*DIMS, num_cells=CELLS)
+    perturbation = TensorDictModule(
+        lambda observation, action: torch.ones_like(action) * torch.tensor([1.0, -1.0]),
+        in_keys=["observation", "action"],
+        out_keys=["perturbation"],
+    )
+    low, high = torch.tensor([-0.1, -0.2]), torch.tensor([0.3, 0.05])
+    critic = near(0.2)
+    policy = BCQPolicy(
+        generator.decoder,
+        critic,
+        perturbation,
+        latent_dim=LATENT_DIM,
+        max_perturbation=0.25,
+        bounds=(low, high),
+    )
+    proposed, judged = recorded(generator.decoder.module), recorded(critic.module)
+    action = policy(observations(5))["action"]
+    moved = (proposed[0][1] + 0.25 * torch.tensor([1.0, -1.0])).clamp(low, high)
+    assert torch.equal(judged[0][0][1], moved)
+    best = (moved - 0.2).square().sum(-1).argmin(-1)
+    assert torch.equal(action, moved[torch.arange(5), best])
+
+
+def test_student_policy_reads_the_task_latent() -> None:
+    torch.manual_seed(0)
+    decoder = make_decoder(*DIMS, LATENT_DIM, task_latent_dim=TASK_LATENT_DIM, num_cells=CELLS)
+    critic = make_qvalue_network(*DIMS, task_latent_dim=TASK_LATENT_DIM, num_cells=CELLS)
+    policy = BCQPolicy(decoder, critic, latent_dim=LATENT_DIM)
+    assert policy.in_keys == ["observation", "task_latent"]
+    assert policy.out_keys == ["action"]
+    decoded, judged = recorded(decoder.module), recorded(critic.module)
+    data = observations(5).set("task_latent", torch.randn(5, TASK_LATENT_DIM))
+    policy(data)
+    expected = data["task_latent"].unsqueeze(-2).expand(5, 100, TASK_LATENT_DIM)
+    assert torch.equal(decoded[0][0][2], expected)
+    assert torch.equal(judged[0][0][2], expected)
+    with pytest.raises(KeyError, match="task_latent"):
+        policy(observations(5))
+
+
+@pytest.mark.parametrize("perturbation", [False, True])
+@pytest.mark.parametrize("clip", [0.25, None])
+@pytest.mark.filterwarnings(NO_UPDATER)
+def test_policy_of_a_loss_acts_with_its_networks_and_first_critic(
+    perturbation: bool, clip: float | None
+) -> None:
+    loss = make_bcq_loss(
+        perturbation=perturbation,
+        latent_clip=clip,
+        max_perturbation=0.4,
+        bounds=(torch.tensor([-0.25, -0.5]), torch.tensor([0.5, 0.75])),
+    )
+    loss(transitions(8))  # the policy of a loss in use
+    policy = BCQPolicy.from_loss(loss, num_candidates=20)
+    calls = recorded(policy.decoder.module)
+    data = transitions(6).select("observation")
+    action = policy(data)["action"]
+    (observation, latent), _ = calls[0]
+    assert latent.shape == (6, 20, LATENT_DIM)
+    assert latent.abs().max() > 1 if clip is None else latent.abs().max() == clip
+
+    candidates = np.tanh(
+        numpy_mlp(loss.generator_params["decoder", "module", "network"], observation, latent)
+    )
+    if perturbation:
+        network = loss.perturbation_network_params["module", "network"]
+        xi = np.tanh(numpy_mlp(network, observation, candidates))
+        candidates = np.clip(candidates + 0.4 * xi, [-0.25, -0.5], [0.5, 0.75])
+    q = numpy_mlp(loss.qvalue_network_params["module"][0], observation, candidates)[..., 0]
+    np.testing.assert_allclose(action, candidates[np.arange(6), q.argmax(-1)], rtol=1e-8)
+
+
+@pytest.mark.filterwarnings(NO_UPDATER)
+def test_policy_of_a_loss_is_a_copy() -> None:
+    loss = make_bcq_loss(perturbation=True)
+    before = {key: value.clone() for key, value in loss.state_dict().items()}
+    policy = BCQPolicy.from_loss(loss)
+    assert not any(parameter.requires_grad for parameter in policy.parameters())
+    assert all(parameter.requires_grad for parameter in loss.parameters())
+    data = transitions(6).select("observation")
+    torch.manual_seed(0)
+    action = policy(data)["action"].clone()
+    losses = loss(transitions(8))
+    sum(losses[key] for key in losses.keys() if key.startswith("loss_")).backward()  # noqa: SIM118
+    torch.optim.SGD(loss.parameters(), lr=10.0).step()
+    torch.manual_seed(0)
+    assert torch.equal(policy(data)["action"], action)
+    for parameter in policy.parameters():
+        parameter.data.zero_()
+    now = loss.state_dict()
+    assert all(now[key].any() for key, value in before.items() if value.any())
+
+
+def test_a_policy_needs_a_candidate() -> None:
+    with pytest.raises(BMRLError, match="num_candidates is 0; valid: at least 1"):
+        BCQPolicy(ActionVAE(*DIMS).decoder, near(), latent_dim=LATENT_DIM, num_candidates=0)
+
+
+# -- the task embedding ------------------------------------------------------------------------
+
+
+def test_task_encoder_embeds_the_transition_in_this_order() -> None:
+    torch.manual_seed(0)
+    encoder = make_task_encoder(*DIMS, TASK_LATENT_DIM, num_cells=CELLS)
+    data = transitions(2, 4, dtype=torch.float32)
+    parameters = TensorDict.from_module(encoder)["module"]
+    expected = numpy_mlp(
+        parameters,
+        data["observation"],
+        data["action"],
+        data["next", "reward"],
+        data["next", "observation"],
+    )
+    result = encoder(data)["task_latent"]
+    np.testing.assert_allclose(result.detach(), expected, rtol=1e-4, atol=1e-6)
+
+
+def test_task_classifier_is_one_linear_layer() -> None:
+    classifier = make_task_classifier(6, TASK_LATENT_DIM)
+    assert [tuple(p.shape) for p in classifier.parameters()] == [(6, TASK_LATENT_DIM), (6,)]
+    m = torch.randn(4, TASK_LATENT_DIM)
+    logits = classifier(TensorDict({"task_latent": m}, [4]))["task_logits"]
+    torch.testing.assert_close(logits, m @ classifier.module.weight.T + classifier.module.bias)
+
+
+def test_prototype_is_the_mean_or_the_medoid() -> None:
+    points = torch.tensor([[0.0, 0.0], [1.0, 1.0], [1.2, 0.9], [1.1, 4.0], [50.0, 1.1]])
+    assert torch.equal(prototype(points), points.mean(0))
+    # The coordinate-wise median is (1.1, 1.0): not a point; the nearest one is (1, 1).
+    assert prototype(points, "medoid").tolist() == [1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("points", "kind", "message"),
+    [
+        (torch.zeros(3, 2), "mode", "valid: mean, medoid"),
+        (torch.zeros(0, 2), "mean", "at least one"),
+    ],
+)
+def test_prototypes_that_make_no_sense_are_refused(points: Tensor, kind: str, message: str) -> None:
+    with pytest.raises(BMRLError, match=message):
+        prototype(points, kind)
+
+
+class Walk(EnvBase):
+    """Moves by the action; the third coordinate counts the steps; truncates after six."""
+
+    def __init__(self, batch_size: tuple[int, ...] = ()) -> None:
+        super().__init__(batch_size=batch_size)
+        shape = self.batch_size
+        self.observation_spec = Composite(
+            observation=Unbounded((*shape, OBSERVATION_DIM)), shape=shape
+        )
+        self.action_spec = Bounded(-1.0, 1.0, shape=(*shape, ACTION_DIM))
+        self.reward_spec = Unbounded((*shape, 1))
+        flag = Bounded(0, 1, shape=(*shape, 1), dtype=torch.bool)
+        self.full_done_spec = Composite(
+            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=shape
+        )
+
+    def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDict:
+        return TensorDict(
+            {"observation": torch.zeros(*self.batch_size, OBSERVATION_DIM)}, self.batch_size
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        ones = torch.ones(*self.batch_size, 1)
+        observation = tensordict["observation"] + torch.cat([tensordict["action"], ones], -1)
+        truncated = observation[..., -1:] >= 6
+        return TensorDict(
+            {
+                "observation": observation,
+                "reward": observation.sum(-1, keepdim=True),
+                "done": truncated,
+                "truncated": truncated,
+                "terminated": torch.zeros_like(truncated),
+            },
+            self.batch_size,
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+
+POINT = torch.tensor([0.5, -2.0])
+
+
+@pytest.fixture
+def encoder() -> TensorDictModule:
+    torch.manual_seed(0)
+    return make_task_encoder(*DIMS, TASK_LATENT_DIM, num_cells=CELLS)
+
+
+def demonstration() -> TensorDict:
+    """Four transitions, step t at (10 t, 0, t)."""
+    data = transitions(4, dtype=torch.float32)
+    data["observation"] = torch.tensor([[10.0 * t, 0.0, float(t)] for t in range(4)])
+    return data
+
+
+def sources(encoder: TensorDictModule) -> dict[str, Transform]:
+    return {
+        "prototype": PrototypeTaskLatent(POINT),
+        "online": OnlineTaskLatent(encoder, POINT),
+        "time": DemonstrationTaskLatent(demonstration(), encoder),
+        "state": DemonstrationTaskLatent(demonstration(), encoder, alignment="state"),
+    }
+
+
+def embedded(encoder: TensorDictModule, data: TensorDictBase) -> Tensor:
+    with torch.no_grad():
+        return encoder(data.select(*encoder.in_keys))["task_latent"]
+
+
+@pytest.mark.parametrize("name", ["prototype", "online", "time", "state"])
+@pytest.mark.parametrize("batch_size", [(), (2,)])
+def test_environments_with_a_task_latent_keep_to_their_specs(
+    name: str, batch_size: tuple[int, ...], encoder: TensorDictModule
+) -> None:
+    env = TransformedEnv(Walk(batch_size), sources(encoder)[name])
+    check_env_specs(env, seed=0)
+    assert env.observation_spec["task_latent"].shape == (*batch_size, TASK_LATENT_DIM)
+
+
+@pytest.mark.parametrize("batch_size", [(), (2,)])
+def test_prototype_is_constant(batch_size: tuple[int, ...]) -> None:
+    rollout = TransformedEnv(Walk(batch_size), PrototypeTaskLatent(POINT)).rollout(10)
+    assert rollout.shape == (*batch_size, 6)
+    for latent in (rollout["task_latent"], rollout["next", "task_latent"]):
+        assert torch.equal(latent, POINT.expand(*batch_size, 6, TASK_LATENT_DIM))
+
+
+@pytest.mark.parametrize("batch_size", [(), (2,)])
+def test_online_is_the_embedding_of_the_last_transition_and_the_prototype_at_first(
+    batch_size: tuple[int, ...], encoder: TensorDictModule
+) -> None:
+    env = TransformedEnv(Walk(batch_size), OnlineTaskLatent(encoder, POINT))
+    for _ in range(2):  # the second episode starts from the prototype again
+        rollout = env.rollout(10)
+        latent = rollout["task_latent"]
+        assert torch.equal(latent[..., 0, :], POINT.expand(*batch_size, TASK_LATENT_DIM))
+        expected = embedded(encoder, rollout)
+        torch.testing.assert_close(rollout["next", "task_latent"], expected)
+        torch.testing.assert_close(latent[..., 1:, :], expected[..., :-1, :])
+    assert not rollout["next", "task_latent"].requires_grad
+
+
+def test_demonstration_by_time_goes_step_by_step_and_holds_its_last(
+    encoder: TensorDictModule,
+) -> None:
+    env = TransformedEnv(Walk(), DemonstrationTaskLatent(demonstration(), encoder))
+    latents = embedded(encoder, demonstration())
+    for steps in (10, 2, 10):  # an episode that is broken off restarts as well
+        latent = env.rollout(steps)["task_latent"]
+        expected = latents[torch.arange(min(steps, 6)).clamp(max=3)]
+        assert torch.equal(latent, expected)
+
+
+@pytest.mark.parametrize("batch_size", [(), (2,)])
+def test_demonstration_by_state_takes_the_nearest_observation(
+    batch_size: tuple[int, ...], encoder: TensorDictModule
+) -> None:
+    env = TransformedEnv(
+        Walk(batch_size), DemonstrationTaskLatent(demonstration(), encoder, alignment="state")
+    )
+    latents = embedded(encoder, demonstration())
+    assert torch.equal(env.reset()["task_latent"], latents[0].expand(*batch_size, TASK_LATENT_DIM))
+    for x, nearest in ((18.0, 2), (-7.0, 0), (999.0, 3)):
+        data = env.reset()
+        data["observation"] = torch.tensor([x, 0.0, 0.0]).expand(*batch_size, OBSERVATION_DIM)
+        data["action"] = torch.zeros(*batch_size, ACTION_DIM)
+        latent = env.step(data)["next", "task_latent"]
+        assert torch.equal(latent, latents[nearest].expand(*batch_size, TASK_LATENT_DIM))
+
+
+def test_sources_hold_copies_without_gradients(encoder: TensorDictModule) -> None:
+    point = POINT.clone().requires_grad_()
+    transform = PrototypeTaskLatent(point)
+    point.data.add_(1.0)
+    assert torch.equal(transform.task_latent, POINT)
+    data = demonstration()
+    transform = DemonstrationTaskLatent(data, encoder)
+    latents = transform.latents.clone()
+    for parameter in encoder.parameters():
+        parameter.data.zero_()
+    assert torch.equal(transform.latents, latents)
+    assert not transform.latents.requires_grad
+
+
+def test_an_unknown_alignment_is_refused_with_the_valid_ones(encoder: TensorDictModule) -> None:
+    with pytest.raises(BMRLError, match="'phase'; valid: time, state"):
+        DemonstrationTaskLatent(demonstration(), encoder, alignment="phase")
+
+
+def test_a_demonstration_is_no_transform_of_stored_data(encoder: TensorDictModule) -> None:
+    with pytest.raises(BMRLError, match="environment"):
+        DemonstrationTaskLatent(demonstration(), encoder)(demonstration())
+
+
+def test_student_acts_in_an_environment_with_a_task_latent(encoder: TensorDictModule) -> None:
+    policy = BCQPolicy(
+        make_decoder(*DIMS, LATENT_DIM, task_latent_dim=TASK_LATENT_DIM, num_cells=CELLS),
+        make_qvalue_network(*DIMS, task_latent_dim=TASK_LATENT_DIM, num_cells=CELLS),
+        latent_dim=LATENT_DIM,
+    )
+    for transform in sources(encoder).values():
+        rollout = TransformedEnv(Walk(), transform).rollout(10, policy)
+        assert rollout["action"].abs().max() <= 1.0
+        assert len(rollout["action"].unique(dim=0)) == 6

@@ -1,0 +1,193 @@
+"""One observation for data and environments; normalisation that weighs every task alike."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("gymnasium")
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.data import Composite, Unbounded
+
+from torchrl_bmrl.data.replay import stack_episodes
+from torchrl_bmrl.envs.transforms import (
+    OBSERVATION_PARTS,
+    ObservationStatistics,
+    SinCosTransform,
+    make_observation_transform,
+    transform_data,
+)
+
+SIZES = {
+    "robot0_joint_pos": 7,
+    "robot0_gripper_qpos": 2,
+    "robot0_joint_vel": 7,
+    "robot0_eef_pos": 3,
+    "robot0_eef_quat": 4,
+    "goal_pos": 3,
+}
+
+
+def random_episodes(count: int, *, seed: int, loc: float = 0.0, scale: float = 1.0) -> list[dict]:
+    rng = np.random.default_rng(seed)
+
+    def parts() -> dict[str, np.ndarray]:
+        return {name: loc + scale * rng.standard_normal((6, size)) for name, size in SIZES.items()}
+
+    return [
+        {
+            "obs": parts(),
+            "next_obs": parts(),
+            "actions": rng.uniform(-1, 1, (6, 7)).astype(np.float32),
+            "rewards": np.zeros(6),
+            "successes": np.zeros(6, bool),
+        }
+        for _ in range(count)
+    ]
+
+
+def raw_observation(parts: dict[str, np.ndarray]) -> np.ndarray:
+    """``observation`` as the documentation spells it."""
+    joints = parts["robot0_joint_pos"]
+    names = list(SIZES)[1:]
+    return np.concatenate([np.sin(joints), np.cos(joints), *(parts[n] for n in names)], axis=-1)
+
+
+def test_zero_and_a_full_turn_are_the_same_point() -> None:
+    transform = SinCosTransform("q", "sin", "cos")
+    angles = torch.tensor([[0.0, 1.0, -3.0], [2 * torch.pi, 1 + 2 * torch.pi, 2 * torch.pi - 3]])
+    out = transform(TensorDict({"q": angles.double()}, [2]))
+    torch.testing.assert_close(out["sin"][0], out["sin"][1], atol=1e-6, rtol=0)
+    torch.testing.assert_close(out["cos"][0], out["cos"][1], atol=1e-6, rtol=0)
+    # And no other angle is: both parts are needed.
+    assert (out["sin"][0] ** 2 + out["cos"][0] ** 2).allclose(torch.ones(3).double())
+    torch.testing.assert_close(torch.atan2(out["sin"][0], out["cos"][0]).float(), angles[0])
+
+
+def test_angles_are_replaced_in_the_data_and_in_the_specification() -> None:
+    transform = SinCosTransform("q", "sin", "cos")
+    assert set(transform(TensorDict({"q": torch.ones(4, 7)}, [4])).keys()) == {"sin", "cos"}
+    spec = transform.transform_observation_spec(Composite(q=Unbounded((7,), dtype=torch.float64)))
+    assert {key: (part.shape, part.dtype) for key, part in spec.items()} == {
+        "sin": ((7,), torch.float64),
+        "cos": ((7,), torch.float64),
+    }
+
+
+def test_observation_is_33_numbers_in_the_documented_order() -> None:
+    assert OBSERVATION_PARTS == (
+        "sin_joint_pos",
+        "cos_joint_pos",
+        "robot0_gripper_qpos",
+        "robot0_joint_vel",
+        "robot0_eef_pos",
+        "robot0_eef_quat",
+        "goal_pos",
+    )
+    (episode,) = random_episodes(1, seed=0)
+    data = stack_episodes([episode], task=0)
+    out = make_observation_transform()(data.copy())
+    expected = torch.as_tensor(raw_observation(episode["obs"])).float()
+    assert out["observation"].shape == (6, 33)
+    torch.testing.assert_close(out["observation"], expected)
+    assert not set(SIZES) & set(out.keys())
+
+
+def test_stored_transitions_are_normalised_now_and_next() -> None:
+    (episode,) = random_episodes(1, seed=1)
+    statistics = ObservationStatistics(torch.arange(33.0), torch.linspace(0.5, 2, 33))
+    data = stack_episodes([episode], task=3)
+    kept = data.clone()
+    out = transform_data(data, statistics)
+    for observation, group in (
+        (out["observation"], "obs"),
+        (out["next", "observation"], "next_obs"),
+    ):
+        raw = torch.as_tensor(raw_observation(episode[group])).float()
+        torch.testing.assert_close(observation, (raw - statistics.loc) / statistics.scale)
+        assert observation.dtype == torch.float32
+    for key in ("action", "task", "step", ("next", "reward"), ("next", "truncated")):
+        assert out[key].equal(kept[key])
+    assert (data == kept).all()  # the argument is left as it was
+
+
+def test_every_task_weighs_the_same_however_many_steps_it_has() -> None:
+    few = stack_episodes(random_episodes(2, seed=2, loc=1.0, scale=0.1), task=0)
+    many = stack_episodes(random_episodes(40, seed=3, loc=-1.0, scale=0.1), task=1)
+    statistics = ObservationStatistics.of([few, many])
+    assert ObservationStatistics.of([few, few, many]).loc[20] > statistics.loc[20] + 0.2
+    # Goal and positions: half of the weight at +1, half at -1.
+    torch.testing.assert_close(statistics.loc[23:], torch.zeros(10), atol=0.1, rtol=0)
+    torch.testing.assert_close(statistics.scale[23:], torch.ones(10), atol=0.1, rtol=0)
+    repeated = stack_episodes(random_episodes(2, seed=2, loc=1.0, scale=0.1) * 20, task=0)
+    again = ObservationStatistics.of([repeated, many])
+    torch.testing.assert_close(again.loc, statistics.loc)
+    torch.testing.assert_close(again.scale, statistics.scale)
+
+
+def test_normalised_training_data_have_mean_0_and_deviation_1() -> None:
+    datasets = [
+        stack_episodes(random_episodes(5, seed=i, loc=i, scale=1 + i), task=i) for i in range(3)
+    ]
+    statistics = ObservationStatistics.of(datasets)
+    observation = torch.cat([transform_data(d, statistics)["observation"] for d in datasets])
+    torch.testing.assert_close(observation.mean(0), torch.zeros(33), atol=1e-5, rtol=0)
+    torch.testing.assert_close(observation.std(0, correction=0), torch.ones(33), atol=1e-5, rtol=0)
+
+
+def test_a_part_that_never_changes_stays_finite() -> None:
+    data = stack_episodes(random_episodes(2, seed=0), task=0)
+    data["goal_pos"] = torch.full_like(data["goal_pos"], 0.8)
+    statistics = ObservationStatistics.of([data])
+    out = transform_data(data, statistics)["observation"]
+    assert (statistics.scale > 0).all()
+    assert out.isfinite().all()
+    torch.testing.assert_close(out[:, 30:], torch.zeros(12, 3), atol=1e-3, rtol=0)
+
+
+@pytest.mark.robosuite
+def test_data_and_environment_give_the_same_observation_for_the_same_episode() -> None:
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    from torchrl_bmrl.envs.tasks import SawyerEnv
+    from torchrl_bmrl.envs.transforms import make_env
+
+    rng = np.random.default_rng(0)
+    statistics = ObservationStatistics(
+        torch.as_tensor(rng.normal(size=33)).float(),
+        torch.as_tensor(rng.uniform(0.5, 2, 33)).float(),
+    )
+    actions = rng.uniform(-1, 1, (8, 7)).astype(np.float32)
+
+    env = SawyerEnv("push_left")
+    parts, _ = env.reset(seed=7)
+    shown, rewards = [parts], []
+    for action in actions:
+        parts, reward, *_ = env.step(action)
+        shown.append(parts)
+        rewards.append(reward)
+    env.close()
+    stacked = {name: np.stack([parts[name] for parts in shown]) for name in SIZES}
+    episode = {
+        "obs": {name: part[:-1] for name, part in stacked.items()},
+        "next_obs": {name: part[1:] for name, part in stacked.items()},
+        "actions": actions,
+        "rewards": np.array(rewards),
+        "successes": np.zeros(8, bool),
+    }
+    stored = transform_data(stack_episodes([episode], task=0), statistics)
+
+    env = make_env("push_left", statistics)
+    steps = iter(torch.as_tensor(actions))
+    lived = env.rollout(
+        8,
+        TensorDictModule(lambda _: next(steps), ["observation"], ["action"]),
+        tensordict=env.reset(seed=7),
+        auto_reset=False,
+    )
+    env.close()
+    for key in ("observation", ("next", "observation"), ("next", "reward"), "action"):
+        assert lived[key].shape == stored[key].shape
+        assert lived[key].equal(stored[key]), key
