@@ -457,6 +457,23 @@ def test_demonstration_by_time_goes_step_by_step_and_holds_its_last(
         assert torch.equal(latent, expected)
 
 
+@pytest.mark.parametrize("name", ["online", "time"])
+def test_of_several_environments_only_those_that_restart_start_again(
+    name: str, encoder: TensorDictModule
+) -> None:
+    env = TransformedEnv(Walk((2,)), sources(encoder)[name])
+    data = env.reset()
+    first = data["task_latent"][0].clone()
+    for _ in range(2):
+        data = env.step(env.rand_action(data))["next"].exclude("reward")
+    before = data["task_latent"].clone()
+    data = env.reset(data.set("_reset", torch.tensor([[True], [False]])))
+    assert torch.equal(data["task_latent"], torch.stack([first, before[1]]))
+    latent = env.step(env.rand_action(data))["next", "task_latent"]
+    if name == "time":
+        assert torch.equal(latent, embedded(encoder, demonstration())[[1, 3]])
+
+
 @pytest.mark.parametrize("batch_size", [(), (2,)])
 def test_demonstration_by_state_takes_the_nearest_observation(
     batch_size: tuple[int, ...], encoder: TensorDictModule

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import multiprocessing
 import os
 import queue
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -27,6 +29,15 @@ def _start_worker(progress: Any) -> None:
     global _progress
     _progress = progress
     torch.set_num_threads(1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    # A worker that outlives a killed run would write into the folder of the run that goes on.
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _run(function: Callable[[Job, Report], Result], job: Job) -> Result:
@@ -84,29 +95,29 @@ def _run_in_processes(
     context = multiprocessing.get_context("spawn")
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"  # read by the children's numpy at import
-    with context.Manager() as manager:
-        progress = manager.Queue()
-        executor = ProcessPoolExecutor(workers, context, _start_worker, (progress,))
-        try:
-            futures = [executor.submit(_run, function, job) for job in jobs]
-            pending = set(futures)
-            while pending:
-                done, pending = wait(pending, timeout=0.2, return_when=FIRST_COMPLETED)
-                _drain(progress, bar)
-                for future in done:
-                    future.result()
-            return [future.result() for future in futures]
-        except BrokenProcessPool as error:
-            raise BMRLError(
-                f"{bar.desc}: a worker process was killed (out of memory?); what was finished is "
-                "kept, the same command goes on"
-            ) from error
-        finally:
-            executor.shutdown(wait=True, cancel_futures=True)
-            if before is None:
-                del os.environ["OMP_NUM_THREADS"]
-            else:
-                os.environ["OMP_NUM_THREADS"] = before
+    progress: Any = context.Queue()
+    executor = ProcessPoolExecutor(workers, context, _start_worker, (progress,))
+    try:
+        futures = [executor.submit(_run, function, job) for job in jobs]
+        pending = set(futures)
+        while pending:
+            done, pending = wait(pending, timeout=0.2, return_when=FIRST_COMPLETED)
+            _drain(progress, bar)
+            for future in done:
+                future.result()
+        return [future.result() for future in futures]
+    except BrokenProcessPool as error:
+        raise BMRLError(
+            f"{bar.desc}: a worker process was killed (out of memory?); what was finished is "
+            "kept, the same command goes on"
+        ) from error
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)
+        _drain(progress, bar)
+        if before is None:
+            del os.environ["OMP_NUM_THREADS"]
+        else:
+            os.environ["OMP_NUM_THREADS"] = before
 
 
 def _drain(progress: Any, bar: tqdm) -> None:
@@ -124,7 +135,5 @@ def derive_seed(seed: int, *names: str | int) -> int:
         >>> derive_seed(0, "collect", "lift", 3) == derive_seed(0, "evaluate", "lift", 3)
         False
     """
-    import hashlib
-
     text = "/".join(str(part) for part in (seed, *names))
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "little")

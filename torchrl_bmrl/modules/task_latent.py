@@ -105,13 +105,10 @@ class PrototypeTaskLatent(Transform):
         super().__init__(in_keys=[], out_keys=["task_latent"])
         self.register_buffer("task_latent", task_latent.detach().clone())
 
-    def _latent(self, batch_size: torch.Size, row: Tensor | None = None) -> Tensor:
-        latent = self.task_latent if row is None else row
-        return latent.expand(*batch_size, latent.shape[-1]).clone()
-
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the point into a batch of any shape."""
-        return tensordict.set("task_latent", self._latent(tensordict.batch_size))
+        shape = (*tensordict.batch_size, self.task_latent.shape[-1])
+        return tensordict.set("task_latent", self.task_latent.expand(shape).clone())
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -179,12 +176,11 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
         self.alignment = alignment
         self.register_buffer("latents", latents)
         self.register_buffer("observations", demonstration.get("observation").clone())
-        self._time = 0
+        self._time = torch.zeros((), dtype=torch.int64)
 
     def _aligned(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.alignment == "time":
-            row = torch.tensor(min(self._time, len(self.latents) - 1))
-            latent = self._latent(tensordict.batch_size, self.latents[row])
+            latent = self.latents[self._time.clamp(max=len(self.latents) - 1)]
         else:
             distance = torch.cdist(
                 tensordict.get("observation").reshape(-1, self.observations.shape[-1]),
@@ -197,11 +193,18 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        self._time = 0
+        start = torch.zeros(
+            tensordict_reset.batch_size, dtype=torch.int64, device=self.latents.device
+        )
+        reset = None if tensordict is None else tensordict.get("_reset", None)
+        # Of several environments some may restart while others go on.
+        self._time = (
+            start if reset is None else torch.where(reset.reshape(start.shape), start, self._time)
+        )
         return self._aligned(tensordict_reset)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self._time += 1
+        self._time = self._time + 1
         return self._aligned(next_tensordict)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
