@@ -14,6 +14,8 @@ from torchrl_bmrl.agents import LATENT_SOURCES
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.experts.controllers import ExpertGains
 from torchrl_bmrl.names import TASKS, check_task
+from torchrl_bmrl.objectives.bcq import LOSS_FUNCTIONS
+from torchrl_bmrl.objectives.distillation import CONTEXTS
 from torchrl_bmrl.runs import LOGGERS, open_run
 
 
@@ -59,7 +61,7 @@ class DistillSettings:
     cosine: bool = True  # decay of the learning rate to zero
     num_cells: list[int] = field(default_factory=lambda: [256, 256])
     task_latent_dim: int = 2
-    context: str = "previous"  # current (the paper's), previous, random, set
+    context: str = "set"  # what m is computed from: current (the paper's), previous, random, set
     context_fraction: float = 0.5
     context_size: int = 8
     detach_task_latent: bool = False  # True: cross-entropy alone trains the encoder
@@ -105,6 +107,7 @@ POSITIVE = (
     "checkpoint_interval",
     "bcq.epochs",
     "bcq.updates_per_epoch",
+    "bcq.eval_episodes",
     "bcq.batch_size",
     "bcq.lr",
     "distill.updates",
@@ -114,6 +117,12 @@ POSITIVE = (
     "evaluate.episodes",
     "evaluate.num_candidates",
 )
+CHOICES = {
+    "logger": LOGGERS,
+    "bcq.loss_function": LOSS_FUNCTIONS,
+    "distill.context": CONTEXTS,
+    "distill.prototype": ("mean", "medoid"),
+}
 
 
 def check_settings(config: Config) -> None:
@@ -125,19 +134,22 @@ def check_settings(config: Config) -> None:
     for task in [*config.tasks, *config.collect.train_episodes]:
         check_task(task)
     missing = [task for task in config.tasks if task not in config.collect.train_episodes]
-    if not config.tasks or missing:
+    if not config.tasks or missing or len(set(config.tasks)) < len(config.tasks):
         raise ConfigError(
-            f"tasks is {config.tasks}; valid: at least one, each with a number in "
+            f"tasks is {config.tasks}; valid: at least one, each once and with a number in "
             "collect.train_episodes"
         )
+    if not config.evaluate.latent_sources:
+        raise ConfigError(f"evaluate.latent_sources is []; valid: some of {list(LATENT_SOURCES)}")
     for source in config.evaluate.latent_sources:
         if source not in LATENT_SOURCES:
             raise UnknownNameError("latent source", source, LATENT_SOURCES)
-    if config.logger not in LOGGERS:
-        raise UnknownNameError("logger", config.logger, LOGGERS)
+    settings = OmegaConf.structured(config)
+    for key, valid in CHOICES.items():
+        if (value := OmegaConf.select(settings, key)) not in valid:
+            raise UnknownNameError(key, value, valid)
     for key in POSITIVE:
-        value = OmegaConf.select(OmegaConf.structured(config), key)
-        if value <= 0:
+        if (value := OmegaConf.select(settings, key)) <= 0:
             raise ConfigError(f"{key} is {value}; valid: above 0")
     if config.collect.valid_episodes < 1 or min(config.collect.train_episodes.values()) < 1:
         raise ConfigError("collect.train_episodes and collect.valid_episodes; valid: at least 1")

@@ -523,7 +523,7 @@ def test_the_goal_marker_is_visible_in_the_picture(tmp_path: Path) -> None:
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=600,
     )
     if done.returncode == 77:
         pytest.skip(f"MUJOCO_GL={environment['MUJOCO_GL']} cannot render: {done.stdout.strip()}")
@@ -560,7 +560,7 @@ env.close()
 
 def test_importing_constructing_and_stepping_print_nothing(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", SILENT], cwd=tmp_path, capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", SILENT], cwd=tmp_path, capture_output=True, text=True, timeout=600
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert list(tmp_path.iterdir()) == []

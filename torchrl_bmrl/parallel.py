@@ -86,7 +86,13 @@ def run_jobs(
                 return [function(job, bar.update) for job in jobs]
             finally:
                 torch.set_num_threads(threads)
-        return _run_in_processes(function, jobs, min(workers, len(jobs)), bar)
+        try:
+            return _run_in_processes(function, jobs, min(workers, len(jobs)), bar)
+        except BrokenProcessPool as error:
+            raise BMRLError(
+                f"{description}: a worker process was killed (out of memory?); what was finished "
+                "is kept, the same command goes on"
+            ) from error
 
 
 def _run_in_processes(
@@ -106,11 +112,6 @@ def _run_in_processes(
             for future in done:
                 future.result()
         return [future.result() for future in futures]
-    except BrokenProcessPool as error:
-        raise BMRLError(
-            f"{bar.desc}: a worker process was killed (out of memory?); what was finished is "
-            "kept, the same command goes on"
-        ) from error
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
         _drain(progress, bar)

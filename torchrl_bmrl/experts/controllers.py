@@ -31,7 +31,8 @@ class ExpertGains:
         position: share of the position error asked for in one action.
         rotation: share of the rotation error asked for in one action.
         speed_limit: largest position action of an expert in free motion, in (0, 1].
-        push_speed_limit: largest position action while pushing, in (0, 1].
+        contact_speed_limit: largest position action when coming down on the cube and when
+            pushing it, in (0, 1]. At full speed the arm drifts sideways as it descends.
         grasp_steps: steps given to the gripper to close; it needs 10 from fully open.
         lift_height: height above its start that the cube is lifted to [m].
         push_line: distance from the table's centre along the direction to which the cube is
@@ -41,7 +42,7 @@ class ExpertGains:
     position: float = 4.0
     rotation: float = 1.0
     speed_limit: float = 1.0
-    push_speed_limit: float = 0.7
+    contact_speed_limit: float = 0.7
     grasp_steps: int = 10
     lift_height: float = 0.10
     push_line: float = 0.20
@@ -103,10 +104,10 @@ class LiftExpert(Expert):
         self._closing = 0
 
     def _target(self) -> tuple[np.ndarray, float, float]:
-        cube, limit = self.env.goal, self.gains.speed_limit
+        cube, limit = self.env.goal, self.gains.contact_speed_limit
         if self.phase == 0:
             offset = self.env.eef_position - cube
-            if np.linalg.norm(offset[:2]) < 0.015 and abs(offset[2]) < 0.01:
+            if np.linalg.norm(offset[:2]) < 0.008 and abs(offset[2]) < 0.008:
                 self.phase = 1
             # Only above the cube is it safe to go down.
             elif np.linalg.norm(offset[:2]) > 0.03:
@@ -120,9 +121,9 @@ class LiftExpert(Expert):
         top = cube.copy()
         top[2] = self.env.cube_start[2] + self.gains.lift_height
         if not self.env.grasped and cube[2] < self.env.cube_start[2] + 0.01:
-            self.reset()  # dropped or missed
+            self.phase, self._closing = 0, 0  # dropped or missed
             return cube + np.array([0.0, 0.0, 0.05]), OPEN, limit
-        return top, CLOSE, limit
+        return top, CLOSE, self.gains.speed_limit
 
 
 class PushExpert(Expert):
@@ -171,7 +172,7 @@ class PushExpert(Expert):
         # it is clear of the cube, where friction does not drag it along sideways.
         pushing = cube @ along < self.gains.push_line and sideways < 0.012
         ahead = 0.05 if pushing else -self.stand_off
-        return cube + ahead * along, CLOSE, self.gains.push_speed_limit
+        return cube + ahead * along, CLOSE, self.gains.contact_speed_limit
 
 
 def make_expert(task: str, env: _BMRLSawyerTask, gains: ExpertGains | None = None) -> Expert:

@@ -99,7 +99,6 @@ class MetaDistillationLoss(LossModule):
         ...     [ActionVAE(3, 2).decoder for _ in range(4)],
         ...     [make_qvalue_network(3, 2) for _ in range(4)],
         ...     latent_dim=4,
-        ...     context="current",
         ... )
         >>> data = TensorDict(
         ...     {
@@ -182,7 +181,7 @@ class MetaDistillationLoss(LossModule):
         direction_weight: float = 1.0,
         qvalue_weight: float = 1.0,
         latent_norm_weight: float = 2e-3,
-        context: str = "previous",
+        context: str = "set",
         context_fraction: float = 0.5,
         context_size: int = 8,
         detach_task_latent: bool = False,

@@ -1,0 +1,314 @@
+"""Checkpoints come back bit by bit, or are refused by name."""
+
+from __future__ import annotations
+
+import os
+import random
+import struct
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from helpers import NO_UPDATER
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+pytest.importorskip("safetensors")
+
+from torchrl_bmrl.agents import Student, load_bcq_loss, load_student, make_bcq_loss
+from torchrl_bmrl.checkpoint import load_checkpoint, load_state, save_checkpoint
+from torchrl_bmrl.errors import CheckpointError
+from torchrl_bmrl.modules import BCQPolicy
+
+META = {"kind": "example", "epochs": 3, "tasks": ["reach", "σ"], "loss": {"clip": None, "lr": 1e-5}}
+SMALL = {"num_cells": [8], "observation_dim": 3, "action_dim": 2}
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run" / "checkpoint.safetensors"
+
+
+def same(a: Any, b: Any) -> bool:
+    """Equality of nested states, tensors bit by bit with their dtype; tuples count as lists."""
+    if isinstance(a, Tensor):
+        return (
+            isinstance(b, Tensor)
+            and a.dtype == b.dtype
+            and a.shape == b.shape
+            and a.contiguous().numpy().tobytes() == b.contiguous().numpy().tobytes()
+        )
+    if isinstance(a, dict):
+        return list(a) == list(b) and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, (list, tuple)):
+        return len(a) == len(b) and all(map(same, a, b))
+    return type(a) is type(b) and a == b
+
+
+def network(width: int = 4) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(3, width), nn.BatchNorm1d(width), nn.Linear(width, 1))
+
+
+def train(net: nn.Module, optimizer: torch.optim.Optimizer, updates: int) -> None:
+    for _ in range(updates):
+        optimizer.zero_grad()
+        (net(torch.randn(8, 3)) - torch.randn(8, 1)).square().mean().backward()
+        optimizer.step()
+
+
+# -- round trips -------------------------------------------------------------------------------
+
+
+def test_a_nested_state_comes_back_bit_by_bit(path: Path) -> None:
+    base = torch.randn(4, 6)
+    state = {
+        "tensors": {
+            "nan": torch.tensor([float("nan"), -0.0, float("inf")]),
+            "double": torch.randn(3, dtype=torch.float64),
+            "long": torch.tensor(2**53 + 1),
+            "bool": torch.tensor([True, False]),
+            "empty": torch.zeros(0, 3),
+            "transposed": base.T,
+            "a view": base[1:3],
+            "the same": base,
+            "and again": base,
+        },
+        "plain": [1, 2.5, None, True, "text", [], {}, {"nested": [torch.ones(2)]}],
+        "by number": {0: {"step": torch.tensor(3.0)}, 7: "seven"},
+    }
+    save_checkpoint(path, state, META)
+    loaded, metadata = load_checkpoint(path, kind="example")
+    assert same(state, loaded)
+    assert metadata == META
+
+
+def test_module_optimizer_and_random_state_come_back_bit_by_bit(path: Path) -> None:
+    torch.manual_seed(0)
+    net = network()
+    optimizer = torch.optim.Adam(net.parameters(), lr=0.01, amsgrad=True)
+    train(net, optimizer, 3)
+    state = {
+        "net": net.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "rng": torch.get_rng_state(),
+    }
+    save_checkpoint(path, state, META)
+    loaded, _ = load_checkpoint(path, kind="example")
+    assert same({**state, "net": dict(state["net"])}, loaded)
+    other = network()
+    load_state(other, loaded["net"], path)
+    assert same(dict(net.state_dict()), dict(other.state_dict()))
+
+
+def test_five_updates_and_five_more_equal_ten(path: Path) -> None:
+    def fresh() -> tuple[nn.Module, torch.optim.Optimizer]:
+        torch.manual_seed(0)
+        net = network()
+        return net, torch.optim.Adam(net.parameters(), lr=0.01)
+
+    whole, optimizer = fresh()
+    train(whole, optimizer, 10)
+
+    net, optimizer = fresh()
+    train(net, optimizer, 5)
+    state = {
+        "net": net.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "rng": torch.get_rng_state(),
+    }
+    save_checkpoint(path, state, META)
+
+    torch.manual_seed(99)
+    net = network()
+    optimizer = torch.optim.Adam(net.parameters(), lr=0.5)
+    loaded, _ = load_checkpoint(path, kind="example")
+    load_state(net, loaded["net"], path)
+    optimizer.load_state_dict(loaded["optimizer"])
+    torch.set_rng_state(loaded["rng"])
+    train(net, optimizer, 5)
+    assert same(dict(whole.state_dict()), dict(net.state_dict()))
+
+
+@pytest.mark.filterwarnings(NO_UPDATER)
+@pytest.mark.parametrize("perturbation", [False, True])
+def test_a_trained_loss_comes_back_from_its_file_alone(path: Path, perturbation: bool) -> None:
+    options = {**SMALL, "perturbation": perturbation, "num_candidates": 5, "latent_clip": None}
+    loss = make_bcq_loss(**options)
+    save_checkpoint(path, {"loss": loss.state_dict()}, {"kind": "bcq", "loss": options})
+    again, metadata = load_bcq_loss(path)
+    assert metadata["loss"] == options
+    assert again.num_candidates == 5
+    assert again.latent_clip is None
+    assert same(dict(loss.state_dict()), dict(again.state_dict()))
+    assert not any(parameter.requires_grad for parameter in again.parameters())
+    actions = []
+    for module in (loss, again):
+        policy = BCQPolicy.from_loss(module)
+        torch.manual_seed(0)
+        actions.append(policy(TensorDict({"observation": torch.zeros(4, 3)}, [4]))["action"])
+    assert torch.equal(*actions)
+
+
+def test_a_student_comes_back_with_its_prototypes(path: Path) -> None:
+    options = {**SMALL, "num_tasks": 3, "latent_dim": 4}
+    student = Student(**options)
+    student.prototypes.normal_()
+    save_checkpoint(
+        path, {"student": student.state_dict()}, {"kind": "student", "student": options}
+    )
+    again, _ = load_student(path)
+    assert same(dict(student.state_dict()), dict(again.state_dict()))
+
+
+def test_a_second_save_replaces_the_first(path: Path) -> None:
+    save_checkpoint(path, {"a": torch.ones(100), "b": 1}, META)
+    save_checkpoint(path, {"a": torch.zeros(2)}, META)
+    assert load_checkpoint(path, kind="example")[0].keys() == {"a"}
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+# -- refusals ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def saved(path: Path) -> Path:
+    torch.manual_seed(0)
+    save_checkpoint(path, {"net": network().state_dict()}, META)
+    return path
+
+
+def refused(path: Path, match: str = "", kind: str = "example") -> None:
+    with pytest.raises(CheckpointError, match=match) as info:
+        load_checkpoint(path, kind=kind)
+    assert str(path) in str(info.value)
+    assert info.value.path == path
+
+
+def test_a_missing_file_or_a_folder_is_refused_by_name(tmp_path: Path) -> None:
+    refused(tmp_path / "none.safetensors", "no such checkpoint")
+    refused(tmp_path, "no such checkpoint")
+
+
+@pytest.mark.parametrize("keep", [0, 4, 8, 100, 0.5, -1])
+def test_a_truncated_file_is_refused_by_name(saved: Path, keep: float) -> None:
+    data = saved.read_bytes()
+    saved.write_bytes(data[: int(keep * len(data)) if keep == 0.5 else int(keep)])
+    refused(saved, "not a whole checkpoint")
+
+
+def test_trailing_bytes_are_refused_by_name(saved: Path) -> None:
+    saved.write_bytes(saved.read_bytes() + b"\0\0\0\0")
+    refused(saved, "not a whole checkpoint")
+
+
+@pytest.mark.parametrize("bit", range(64))
+def test_a_flipped_bit_in_the_header_s_length_is_refused_by_name(saved: Path, bit: int) -> None:
+    data = bytearray(saved.read_bytes())
+    data[bit // 8] ^= 1 << bit % 8
+    saved.write_bytes(data)
+    refused(saved, "not a whole checkpoint")
+
+
+def test_a_flipped_bit_in_the_header_never_ends_in_another_error(saved: Path) -> None:
+    data = saved.read_bytes()
+    (length,) = struct.unpack("<Q", data[:8])
+    assert length > 500
+    count = 0
+    for bit in random.Random(0).sample(range(64, 64 + 8 * length), 400):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        saved.write_bytes(flipped)
+        try:
+            load_checkpoint(saved, kind="example")
+        except CheckpointError:
+            count += 1
+    assert count > 200
+
+
+def test_a_pickle_is_refused_and_not_run(path: Path) -> None:
+    class Trap:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return (os.mkdir, (str(path.parent / "trapped"),))
+
+    path.parent.mkdir()
+    torch.save({"net": network().state_dict(), "trap": Trap()}, path)
+    refused(path, "not a whole checkpoint")
+    assert not (path.parent / "trapped").exists()
+
+
+def test_safetensors_of_another_program_are_refused_by_name(path: Path) -> None:
+    from safetensors.torch import save_file
+
+    path.parent.mkdir()
+    for header in (None, {"format": "pt"}, {"metadata": "{}", "state": "not json"}):
+        save_file({"a": torch.ones(2)}, path, header)
+        refused(path, "not a whole checkpoint")
+
+
+def test_another_kind_is_refused_with_the_valid_one(saved: Path) -> None:
+    refused(saved, "kind is 'example'; valid: 'student'", kind="student")
+    with pytest.raises(CheckpointError, match="valid: 'bcq'"):
+        load_bcq_loss(saved)
+    with pytest.raises(CheckpointError, match="valid: 'student'"):
+        load_student(saved)
+
+
+def test_other_shapes_are_refused_with_key_and_shapes(saved: Path) -> None:
+    state = load_checkpoint(saved, kind="example")[0]["net"]
+    other = network(width=5)
+    before = {key: value.clone() for key, value in other.state_dict().items()}
+    with pytest.raises(CheckpointError, match=r"'0.weight' has shape \(4, 3\).*\(5, 3\)") as info:
+        load_state(other, state, saved)
+    assert str(saved) in str(info.value)
+    assert same(before, dict(other.state_dict()))  # nothing was loaded by halves
+
+
+@pytest.mark.parametrize("where", ["checkpoint", "networks"])
+def test_a_missing_key_is_named_with_where_it_is_missing(saved: Path, where: str) -> None:
+    state = load_checkpoint(saved, kind="example")[0]["net"]
+    net = network()
+    if where == "checkpoint":
+        del state["2.bias"]
+    else:
+        net = nn.Sequential(*net[:2], nn.Linear(4, 1, bias=False))
+    with pytest.raises(CheckpointError, match=f"'2.bias' is missing in the {where}") as info:
+        load_state(net, state, saved)
+    assert info.value.path == saved
+
+
+def test_networks_of_another_size_are_refused_by_name(path: Path) -> None:
+    loss = make_bcq_loss(**SMALL)
+    options = {**SMALL, "num_cells": [16]}
+    save_checkpoint(path, {"loss": loss.state_dict()}, {"kind": "bcq", "loss": options})
+    with pytest.raises(CheckpointError, match="has shape"):
+        load_bcq_loss(path)
+
+
+@pytest.mark.parametrize("failure", ["state", "metadata", "disk"])
+def test_a_failed_save_leaves_the_old_file(
+    saved: Path, failure: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = saved.read_bytes()
+    state: dict[str, Any] = {"net": network().state_dict()}
+    metadata: dict[str, Any] = dict(META)
+    if failure == "state":
+        state["what"] = object()
+    elif failure == "metadata":
+        metadata["where"] = saved
+    else:
+
+        def full(*_: Any) -> None:
+            raise OSError("no space left on device")
+
+        monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises((TypeError, OSError)):
+        save_checkpoint(saved, state, metadata)
+    assert saved.read_bytes() == before
+    assert [file.name for file in saved.parent.iterdir()] == [saved.name]
+
+
+def test_what_a_checkpoint_cannot_hold_is_named(path: Path) -> None:
+    with pytest.raises(TypeError, match="/a/1 is a set"):
+        save_checkpoint(path, {"a": [1, {2}]}, META)
+    assert not path.exists()

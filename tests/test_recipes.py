@@ -1,0 +1,430 @@
+"""The recipes: errors of the command line, whole runs, runs that go on, runs that repeat."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("hydra")
+pytest.importorskip("gymnasium")
+pytest.importorskip("h5py")
+pytest.importorskip("safetensors")
+pytest.importorskip("scipy")
+pytest.importorskip("tqdm")
+
+import yaml
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.evaluation import RESULT_FIELDS, read_results
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+HORIZON = 10
+SMALL = [
+    "preset=smoke",
+    "tasks=[reach,lift]",
+    "collect.train_episodes.reach=1",
+    "collect.train_episodes.lift=1",
+    "bcq.epochs=2",
+    "bcq.updates_per_epoch=6",
+    "bcq.batch_size=8",
+    "bcq.num_cells=[16,16]",
+    "distill.updates=12",
+    "distill.batch_size=8",
+    "distill.num_cells=[16,16]",
+    "evaluate.num_candidates=5",
+    "evaluate.latent_sources=[prototype,online,demonstration]",
+    "log_interval=4",
+    "checkpoint_interval=4",
+]
+"""The smallest run that has every part."""
+
+
+def recipe(name: str, *overrides: str, cwd: Path, **env: str) -> subprocess.CompletedProcess[str]:
+    """Runs a recipe as a person would."""
+    return subprocess.run(
+        [sys.executable, str(RECIPES / f"{name}.py"), *overrides],
+        cwd=cwd,
+        env={**os.environ, **env},
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+
+
+@pytest.fixture(scope="module")
+def recipes() -> Iterator[Any]:
+    """The recipes' modules, importable as they are for a script beside them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(RECIPES))
+        import settings
+
+        yield settings
+
+
+def configured(*overrides: str) -> DictConfig:
+    with initialize_config_dir(version_base="1.3", config_dir=str(RECIPES / "config")):
+        return compose("recipe", overrides=list(overrides))
+
+
+# -- the command line ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (["preset=smoke", "bcq.lrr=1"], ["bcq.lrr", "BCQSettings"]),
+        (["preset=smoke", "bcq.lr=abc"], ["bcq.lr", "'abc'", "Float"]),
+        (["preset=smoke", "tasks=[lfit]"], ["error: unknown task 'lfit'", "reach, lift, push_r"]),
+        (["preset=fast"], ["preset/fast", "literal", "paper", "quick", "smoke"]),
+        (["preset=smoke", "logger=log"], ["unknown logger 'log'", "csv, wandb, tensorboard, none"]),
+        (["preset=smoke", "distill.updates=-5"], ["error: distill.updates is -5", "above 0"]),
+    ],
+    ids=["unknown key", "wrong type", "unknown task", "unknown preset", "unknown logger", "range"],
+)
+def test_an_invalid_setting_is_named_and_nothing_is_written(
+    tmp_path: Path, overrides: list[str], says: list[str]
+) -> None:
+    done = recipe("train_bcq", *overrides, cwd=tmp_path)
+    assert done.returncode != 0
+    for part in says:
+        assert part in done.stderr
+    assert "Traceback" not in done.stdout + done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_path: Path) -> None:
+    done = recipe(
+        "train_bcq", "preset=smoke", "tasks=[lift]", "workers=1", "run_dir=run", cwd=tmp_path
+    )
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1] == (
+        "error: run/data/statistics.json: no such file; recipes/collect.py writes it"
+    )
+    assert "Traceback" not in done.stderr
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {"config.yaml", "versions.json"}
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("tasks=[]", r"tasks is \[\]"),
+        ("tasks=[lift,lift]", "each once"),
+        ("+collect.train_episodes.lfit=1", "unknown task 'lfit'"),
+        ("collect.train_episodes.lift=0", "collect.train_episodes"),
+        ("collect.valid_episodes=0", "collect.valid_episodes"),
+        ("evaluate.latent_sources=[]", r"evaluate.latent_sources is \[\]"),
+        ("evaluate.latent_sources=[mean]", "'mean'; .*prototype, online, demonstration"),
+        ("distill.context=next", "distill.context 'next'; .*current, previous, random, set"),
+        ("distill.prototype=mode", "distill.prototype 'mode'; .*mean, medoid"),
+        ("bcq.loss_function=l3", "bcq.loss_function 'l3'; .*l2, l1, smooth_l1"),
+        ("workers=0", "workers is 0"),
+        ("bcq.lr=0", "bcq.lr is 0"),
+        ("bcq.eval_episodes=0", "bcq.eval_episodes is 0"),
+        ("evaluate.episodes=-1", "evaluate.episodes is -1"),
+        ("checkpoint_interval=0", "checkpoint_interval is 0"),
+    ],
+)
+def test_every_stage_is_checked_before_the_first_one_starts(
+    recipes: Any, tmp_path: Path, override: str, says: str
+) -> None:
+    config = OmegaConf.to_object(configured("preset=smoke", f"run_dir={tmp_path}", override))
+    with pytest.raises(BMRLError, match=says):
+        recipes.check_settings(config)
+
+
+@pytest.mark.parametrize("preset", ["smoke", "quick", "paper", "literal"])
+def test_every_preset_is_complete_and_valid(recipes: Any, tmp_path: Path, preset: str) -> None:
+    config = OmegaConf.to_object(configured(f"preset={preset}", f"run_dir={tmp_path}"))
+    recipes.check_settings(config)
+    assert config.tasks == ["reach", "lift", "push_right", "push_left", "push_up", "push_down"]
+
+
+def test_the_presets_differ_in_what_their_names_say(recipes: Any, tmp_path: Path) -> None:
+    paper, literal, quick = (
+        OmegaConf.to_object(configured(f"preset={preset}", f"run_dir={tmp_path}"))
+        for preset in ("paper", "literal", "quick")
+    )
+    assert list(paper.collect.train_episodes.values()) == [500, 500, 100, 100, 100, 100]
+    assert literal.distill.context_fraction == literal.distill.latent_norm_weight == 0.0
+    assert literal.distill.detach_task_latent
+    assert literal.bcq == quick.bcq
+    assert configured(f"run_dir={tmp_path}") == configured("preset=quick", f"run_dir={tmp_path}")
+
+
+# -- whole runs ------------------------------------------------------------------------------------
+
+Run = Callable[..., Path]
+
+
+def contents(folder: Path, *patterns: str) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for pattern in patterns
+        for path in sorted(folder.glob(pattern))
+        if path.is_file()
+    }
+
+
+def times(folder: Path) -> dict[str, int]:
+    """When what is costly was written."""
+    patterns = ("data/*.hdf5", "**/*.safetensors", "evaluation/*.csv", "bcq/*/evaluations.csv")
+    return {
+        str(path.relative_to(folder)): path.stat().st_mtime_ns
+        for pattern in patterns
+        for path in folder.glob(pattern)
+    }
+
+
+def show_results(folder: Path) -> dict[str, bytes]:
+    return contents(folder, "results.csv", "tables/*", "bcq/*/evaluations.csv")
+
+
+@pytest.fixture(scope="module")
+def run(recipes: Any) -> Iterator[Run]:
+    """Runs a recipe's function in this process, with episodes of ten steps."""
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    from torchrl_bmrl.evaluation import rollout
+    from torchrl_bmrl.experts import collect
+
+    def run(folder: Path, function: Any, *overrides: str) -> Path:
+        settings = configured(*SMALL, f"run_dir={folder}", "workers=1", *overrides)
+        recipes.run_recipe(settings, function)
+        return folder
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(collect, "HORIZON", HORIZON)
+        patch.setitem(rollout.evaluate_policy.__kwdefaults__, "max_steps", HORIZON)
+        yield run
+
+
+@pytest.fixture(scope="module")
+def finished(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of all stages that was never stopped."""
+    import two_stage
+
+    return run(tmp_path_factory.mktemp("finished"), two_stage.two_stage)
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_two_stages_from_an_empty_folder_to_the_report_and_again(tmp_path: Path) -> None:
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    pytest.importorskip("matplotlib")
+    overrides = [*SMALL, "bcq.epochs=1", "evaluate.latent_sources=[online]", "run_dir=run"]
+    done = recipe("two_stage", *overrides, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "report: run/report.html" in done.stdout
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    folder = tmp_path / "run"
+
+    with (folder / "results.csv").open() as file:
+        assert tuple(csv.DictReader(file).fieldnames or ()) == RESULT_FIELDS
+    rows = read_results(folder / "results.csv")
+    counts = {
+        (task, policy, source): sum(
+            (row.task, row.policy, row.latent_source) == (task, policy, source) for row in rows
+        )
+        for task in ("reach", "lift")
+        for policy, source in (("expert", ""), ("bcq", ""), ("distilled", "online"))
+    }
+    # The expert's rows are its two demonstrations.
+    assert list(counts.values()) == [2, 1, 1] * 2
+    assert sum(counts.values()) == len(rows)
+    assert all(0 < row.episode_return < 600 for row in rows)
+
+    for name in ("results", "table1", "table2"):
+        assert "lift" in (folder / "tables" / f"{name}.csv").read_text().lower()
+        assert (folder / "tables" / f"{name}.md").read_text().startswith("|")
+    page = (folder / "report.html").read_text()
+    assert page.rstrip().endswith("</html>")
+    assert page.count("data:image/png;base64") >= 2
+    assert yaml.safe_load((folder / "config.yaml").read_text())["bcq"]["num_cells"] == [16, 16]
+    versions = json.loads((folder / "versions.json").read_text())
+    assert {"torch", "torchrl", "robosuite", "mujoco", "python", "torchrl_bmrl"} <= set(versions)
+    assert set(json.loads((folder / "seconds.json").read_text())) == {
+        "collect",
+        "stage 1",
+        "stage 2",
+        "evaluate",
+    }
+    written = times(folder)
+    for path in (
+        "data/reach.hdf5",
+        "data/lift.hdf5",
+        "bcq/reach/checkpoint.safetensors",
+        "bcq/lift/checkpoint.safetensors",
+        "distill/checkpoint.safetensors",
+        "evaluation/lift-distilled-online.csv",
+    ):
+        assert path in written
+    assert list((folder / "logs").rglob("*.csv"))
+    assert not [path for path in folder.rglob("*") if path.name.endswith(".tmp")]
+
+    before = show_results(folder)
+    done = recipe("two_stage", *overrides, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert times(folder) == written
+    assert show_results(folder) == before
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_one_seed_gives_the_same_bytes_in_one_go_and_recipe_by_recipe(
+    run: Run, finished: Path, tmp_path: Path
+) -> None:
+    import collect
+    import distill
+    import evaluate
+    import train_bcq
+
+    for stage in (collect.collect, train_bcq.train_all, distill.distill, evaluate.evaluate):
+        run(tmp_path, stage)
+    expected = show_results(finished)
+    assert len(expected) == 1 + 6 + 2
+    assert show_results(tmp_path) == expected
+    costly = ("data/*.hdf5", "data/*.json", "**/*.safetensors")
+    assert contents(tmp_path, *costly) == contents(finished, *costly)
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_two_workers_give_the_same_bytes_as_one(finished: Path, tmp_path: Path) -> None:
+    # Other processes: what shortens the episodes here does not reach them.
+    (tmp_path / "patch").mkdir()
+    (tmp_path / "patch" / "sitecustomize.py").write_text(
+        f"import torchrl_bmrl.names\ntorchrl_bmrl.names.HORIZON = {HORIZON}\n"
+    )
+    search = os.pathsep.join(filter(None, [str(tmp_path / "patch"), os.environ.get("PYTHONPATH")]))
+    done = recipe("two_stage", *SMALL, "run_dir=run", "workers=2", cwd=tmp_path, PYTHONPATH=search)
+    assert done.returncode == 0, done.stderr
+    assert show_results(tmp_path / "run") == show_results(finished)
+    checkpoints = contents(finished, "**/*.safetensors")
+    assert len(checkpoints) == 3
+    assert contents(tmp_path / "run", "**/*.safetensors") == checkpoints
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_a_run_goes_on_with_other_workers_but_not_with_other_settings(
+    run: Run, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import two_stage
+
+    folder = shutil.copytree(finished, tmp_path / "run")
+    before, written = show_results(folder), times(folder)
+    with pytest.raises(SystemExit) as caught:
+        run(folder, two_stage.two_stage, "bcq.lr=0.1")
+    assert caught.value.code == 1
+    assert "bcq.lr is 0.1 here and 0.001 in the folder's run" in capsys.readouterr().err
+    run(folder, two_stage.two_stage, "workers=2", "logger=none")
+    assert times(folder) == written
+    assert show_results(folder) == before
+
+
+class Interruption:
+    """A progress callback that stops the job at one of its updates."""
+
+    def __init__(self, update: int, error: type[BaseException]) -> None:
+        self.done, self.update, self.error = 0, update, error
+
+    def __call__(self, count: int) -> None:
+        self.done += count
+        if self.done == self.update:
+            raise self.error("stopped by the test")
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("update", "kept", "error"),
+    # Checkpoints are due after updates 4, 8 and 12, evaluations after 6 and 12.
+    [(3, None, KeyboardInterrupt), (7, 4, KeyboardInterrupt), (12, 8, BMRLError)],
+)
+def test_stage_1_resumed_equals_never_stopped(
+    run: Run, finished: Path, tmp_path: Path, update: int, kept: int | None, error: Any
+) -> None:
+    import train_bcq
+
+    from torchrl_bmrl.checkpoint import load_checkpoint
+
+    shutil.copytree(finished / "data", tmp_path / "data")
+    config = OmegaConf.to_object(configured(*SMALL, f"run_dir={tmp_path}"))
+    checkpoint = tmp_path / "bcq" / "lift" / "checkpoint.safetensors"
+    with pytest.raises(error):
+        train_bcq.train_task((config, "lift"), Interruption(update, error))
+    if kept is None:
+        assert not checkpoint.exists()
+    else:
+        assert load_checkpoint(checkpoint, kind="bcq")[1]["updates"] == kept
+    counted: list[int] = []
+    train_bcq.train_task((config, "lift"), counted.append)
+    # What the checkpoint holds is reported at once and not trained again.
+    assert counted == ([kept] if kept else []) + [1] * (12 - (kept or 0))
+    assert contents(tmp_path, "bcq/lift/*") == contents(finished, "bcq/lift/*")
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+@pytest.mark.parametrize(("update", "kept"), [(3, None), (6, 4), (12, 8)])
+def test_stage_2_resumed_equals_never_stopped(
+    run: Run, finished: Path, tmp_path: Path, update: int, kept: int | None
+) -> None:
+    import distill
+
+    from torchrl_bmrl.checkpoint import load_checkpoint
+
+    for name in ("data", "bcq"):
+        shutil.copytree(finished / name, tmp_path / name)
+    config = OmegaConf.to_object(configured(*SMALL, f"run_dir={tmp_path}"))
+    checkpoint = tmp_path / "distill" / "checkpoint.safetensors"
+    with pytest.raises(KeyboardInterrupt):
+        distill.train_student(config, Interruption(update, KeyboardInterrupt))
+    if kept is None:
+        assert not checkpoint.exists()
+    else:
+        assert load_checkpoint(checkpoint, kind="student")[1]["updates"] == kept
+    counted: list[int] = []
+    distill.train_student(config, counted.append)
+    assert counted == ([kept] if kept else []) + [1] * (12 - (kept or 0))
+    assert contents(tmp_path, "distill/*") == contents(finished, "distill/*")
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+@pytest.mark.parametrize("damage", ["truncated", "not finite"])
+def test_damaged_demonstrations_stop_training_before_anything_is_written(
+    run: Run,
+    finished: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    damage: str,
+) -> None:
+    import h5py
+    import train_bcq
+
+    shutil.copytree(finished / "data", tmp_path / "data")
+    path = tmp_path / "data" / "lift.hdf5"
+    if damage == "truncated":
+        path.write_bytes(path.read_bytes()[:-1000])
+    else:
+        with h5py.File(path, "r+") as file:
+            file["data/demo_0/rewards"][2] = float("nan")
+    with pytest.raises(SystemExit) as caught:
+        run(tmp_path, train_bcq.train_all, "tasks=[lift]")
+    assert caught.value.code == 1
+    message = capsys.readouterr().err.splitlines()[-1]
+    says = "not a whole HDF5 file" if damage == "truncated" else "not finite in row 2"
+    assert message.startswith(f"error: {path}: ")
+    assert says in message
+    assert not (tmp_path / "bcq").exists()

@@ -1,0 +1,199 @@
+"""Run folders say what they were told; logs and metrics are checked."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+pytest.importorskip("yaml")
+
+from torchrl_bmrl import __version__
+from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
+from torchrl_bmrl.runs import (
+    check_finite,
+    log_metrics,
+    make_logger,
+    open_run,
+    read_settings,
+    read_versions,
+)
+
+SETTINGS = {
+    "run_dir": "runs/a",
+    "workers": 1,
+    "logger": "none",
+    "seed": 0,
+    "tasks": ["reach", "lift"],
+    "bcq": {"lr": 1e-5, "num_cells": [8, 8], "latent_clip": None, "schedule": {"kind": "cosine"}},
+}
+
+
+def changed(key: str, value: Any) -> dict[str, Any]:
+    """The settings with one entry set, or removed for ``...``."""
+    settings = json.loads(json.dumps(SETTINGS))
+    *groups, name = key.split(".")
+    group = settings
+    for part in groups:
+        group = group[part]
+    if value is ...:
+        del group[name]
+    else:
+        group[name] = value
+    return settings
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+# -- the folder --------------------------------------------------------------------------------
+
+
+def test_a_new_folder_says_what_it_was_told_and_on_what_it_runs(tmp_path: Path) -> None:
+    folder = tmp_path / "deep" / "run"
+    open_run(folder, SETTINGS)
+    assert set(contents(folder)) == {"config.yaml", "versions.json"}
+    assert read_settings(folder) == SETTINGS
+    versions = read_versions(folder)
+    assert versions["torchrl_bmrl"] == __version__
+    assert versions["torch"] == torch.__version__
+    assert {"python", "torchrl", "tensordict"} <= versions.keys()
+
+
+@pytest.mark.parametrize("key", ["run_dir", "workers", "logger"])
+def test_a_run_goes_on_with_the_same_settings_and_what_is_free_to_change(
+    tmp_path: Path, key: str
+) -> None:
+    open_run(tmp_path, SETTINGS)
+    before = contents(tmp_path)
+    open_run(tmp_path, dict(reversed(SETTINGS.items())))
+    open_run(tmp_path, changed(key, "other"))
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("seed", 1, "seed is 1 here and 0 in the folder's run"),
+        ("tasks", ["reach"], "tasks is "),
+        ("bcq.lr", 1e-4, "bcq.lr is 0.0001 here and 1e-05 in"),
+        ("bcq.latent_clip", 0.5, "bcq.latent_clip is 0.5 here and None in"),
+        ("bcq.schedule.kind", "flat", "bcq.schedule.kind is flat here and cosine in"),
+        ("bcq.tau", 0.5, "bcq.tau is 0.5 here and None in"),
+        ("seed", ..., "seed is None here and 0 in"),
+        ("bcq.workers", 3, "bcq.workers is 3 here"),
+    ],
+)
+def test_other_settings_are_refused_by_the_key_that_differs(
+    tmp_path: Path, key: str, value: Any, message: str
+) -> None:
+    open_run(tmp_path, SETTINGS)
+    before = contents(tmp_path)
+    with pytest.raises(ConfigError) as info:
+        open_run(tmp_path, changed(key, value))
+    assert message in str(info.value)
+    assert str(tmp_path) in str(info.value)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("text", [None, "a: [1", "- 1\n- 2\n", ""])
+def test_a_folder_without_readable_settings_is_refused_by_name(
+    tmp_path: Path, text: str | None
+) -> None:
+    path = tmp_path / "config.yaml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(DataError) as info:
+        read_settings(tmp_path)
+    assert info.value.path == path
+
+
+@pytest.mark.parametrize("text", [None, "{", ""])
+def test_a_folder_without_readable_versions_is_refused_by_name(
+    tmp_path: Path, text: str | None
+) -> None:
+    path = tmp_path / "versions.json"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(DataError) as info:
+        read_versions(tmp_path)
+    assert info.value.path == path
+
+
+# -- loggers -----------------------------------------------------------------------------------
+
+
+def test_no_logger_logs_nothing(tmp_path: Path) -> None:
+    assert make_logger("none", tmp_path, "bcq_lift") is None
+    log_metrics(None, {"loss": torch.tensor(1.0)}, 1)
+    assert not any(tmp_path.iterdir())
+
+
+def test_csv_logs_every_metric_at_its_step(tmp_path: Path) -> None:
+    logger = make_logger("csv", tmp_path, "bcq_lift")
+    for step in (10, 20):
+        log_metrics(logger, {"loss_qvalue": torch.tensor(step / 4), "accuracy": 1}, step)
+    folder = tmp_path / "logs" / "bcq_lift" / "scalars"
+    assert {path.name for path in folder.iterdir()} == {"loss_qvalue.csv", "accuracy.csv"}
+    rows = (folder / "loss_qvalue.csv").read_text().split()
+    assert [tuple(map(float, row.split(","))) for row in rows] == [(10, 2.5), (20, 5.0)]
+
+
+def test_tensorboard_writes_events_in_the_run_folder(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    logger = make_logger("tensorboard", tmp_path, "bcq_lift")
+    log_metrics(logger, {"loss_qvalue": 0.5}, 10)
+    logger.experiment.close()
+    files = list((tmp_path / "logs" / "bcq_lift").glob("events*"))
+    assert len(files) == 1
+    assert b"loss_qvalue" in files[0].read_bytes()
+
+
+@pytest.mark.slow
+def test_wandb_without_an_account_runs_offline_in_the_run_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("wandb")
+    for name in ("WANDB_MODE", "WANDB_API_KEY", "NETRC"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    for name in ("WANDB_CACHE_DIR", "WANDB_CONFIG_DIR", "WANDB_DATA_DIR"):
+        monkeypatch.setenv(name, str(tmp_path / "home"))
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "home").mkdir()
+    logger = make_logger("wandb", tmp_path / "run", "bcq_lift")
+    try:
+        log_metrics(logger, {"loss_qvalue": torch.tensor(0.5)}, 10)
+        settings = logger.experiment.settings
+        assert settings.mode == "offline"
+        assert logger.experiment.project == "torchrl_bmrl"
+        assert logger.experiment.name == "bcq_lift"
+    finally:
+        logger.experiment.finish()
+    runs = list((tmp_path / "run").glob("wandb/offline-run-*/*.wandb"))
+    assert len(runs) == 1
+    assert {path.name for path in tmp_path.iterdir()} <= {"home", "run"}
+
+
+def test_an_unknown_logger_is_refused_with_the_valid_ones(tmp_path: Path) -> None:
+    with pytest.raises(
+        UnknownNameError, match=r"'mlflow'; valid .*: csv, wandb, tensorboard, none"
+    ):
+        make_logger("mlflow", tmp_path, "bcq_lift")
+
+
+# -- metrics -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_a_metric_that_is_not_finite_stops_the_run_by_name(value: float) -> None:
+    metrics = {"loss_generator": torch.tensor(1.0), "loss_qvalue": torch.tensor(value)}
+    with pytest.raises(BMRLError, match=r"bcq lift, update 100: loss_qvalue is (nan|-?inf)"):
+        check_finite(metrics, "bcq lift, update 100")
+    metrics.pop("loss_qvalue")
+    check_finite(metrics, "bcq lift, update 100")
