@@ -10,6 +10,7 @@ import os
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
+from contextlib import closing
 from pathlib import Path
 
 import hydra
@@ -47,7 +48,8 @@ def evaluate_job(job: tuple[Config, str, str, str], report: Report) -> list[Resu
     elif policy_name == "bcq":
         loss, _ = load_bcq_loss(run_dir / "bcq" / task / "checkpoint.safetensors")
         policy = BCQPolicy.from_loss(loss, num_candidates=config.evaluate.num_candidates)
-        outcomes = evaluate_policy(make_env(task, statistics), policy, seeds)
+        with closing(make_env(task, statistics)) as env:
+            outcomes = evaluate_policy(env, policy, seeds)
     else:
         student, metadata = load_student(run_dir / "distill" / "checkpoint.safetensors")
         policy = student.policy(
@@ -59,7 +61,8 @@ def evaluate_job(job: tuple[Config, str, str, str], report: Report) -> list[Resu
         )
         demonstration = held_out[held_out["episode"] == 0]
         transform = student.task_latent_source(source, index, demonstration)
-        outcomes = evaluate_policy(make_env(task, statistics, transform), policy, seeds)
+        with closing(make_env(task, statistics, transform)) as env:
+            outcomes = evaluate_policy(env, policy, seeds)
     report(episodes)
     rows = [
         ResultRow(

@@ -10,6 +10,7 @@ import os
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
+from contextlib import closing
 from pathlib import Path
 
 import hydra
@@ -120,7 +121,8 @@ def evaluate_epoch(config, task, loss, statistics, epoch, update) -> list[dict]:
     count = config.bcq.eval_episodes
     seeds = [derive_seed(config.seed, "curve", task, i) for i in range(count)]
     policy = BCQPolicy.from_loss(loss, num_candidates=config.evaluate.num_candidates)
-    outcomes = evaluate_policy(make_env(task, statistics), policy, seeds)
+    with closing(make_env(task, statistics)) as env:
+        outcomes = evaluate_policy(env, policy, seeds)
     return [
         {
             "epoch": epoch,

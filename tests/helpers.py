@@ -5,7 +5,6 @@ Everything is float64, so that an independent numpy computation can be compared 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -151,8 +150,3 @@ def numpy_mlp(parameters: Any, *inputs: Any) -> np.ndarray:
 def numpy_decoder(parameters: Any, *inputs: Any) -> np.ndarray:
     """A decoder with bounds of ±1 in plain numpy."""
     return np.tanh(numpy_mlp(parameters["module", "network"], *inputs))
-
-
-def per_row(function: Callable[..., TensorDict]) -> TensorDictModule:
-    """A network without parameters, for examples whose answer is known."""
-    return TensorDictModule(function, in_keys=["observation"], out_keys=["task_latent"])

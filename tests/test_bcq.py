@@ -565,6 +565,9 @@ def test_vmap_and_loop_over_critics_agree(batch: tuple[int, ...]) -> None:
     results, gradients = [], []
     for deactivate_vmap in (False, True):
         loss = make_bcq_loss(perturbation=True, deactivate_vmap=deactivate_vmap)
+        calls = recorded(loss.qvalue_network.module)
+        loss.qvalue_loss(transitions(*batch))
+        assert len(calls) == (4 if deactivate_vmap else 2)  # targets and predictions
         torch.manual_seed(0)
         results.append(loss(transitions(*batch)))
         total(results[-1]).backward()

@@ -16,17 +16,20 @@ from helpers import (
     make_teachers,
     numpy_decoder,
     numpy_mlp,
-    per_row,
     recorded,
     task_transitions,
 )
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.objectives import MetaDistillationLoss
 
+Teachers = tuple[list[TensorDictModule], list[TensorDictModule]]
 TASKS, ROWS = 3, 5
+LOC, SCALE = np.array([0.5, -1.0, 2.0]), np.array([1.0, 4.0, 0.5])
+NORMALISATION = {"qvalue_loc": torch.as_tensor(LOC), "qvalue_scale": torch.as_tensor(SCALE)}
 TERMS = ("classification", "generator", "direction", "qvalue", "latent_norm")
 CONTEXTS = ("current", "previous", "random", "set")
 
@@ -51,7 +54,11 @@ def networks_of(grads: dict[str, Tensor]) -> set[str]:
 
 
 def expected_terms(
-    loss: MetaDistillationLoss, data: TensorDict, latent: Tensor, transition: TensorDict
+    loss: MetaDistillationLoss,
+    teachers: Teachers,
+    data: TensorDict,
+    latent: Tensor,
+    transition: TensorDict,
 ) -> dict[str, np.ndarray]:
     """The terms per row without their weights, in numpy, for given action latents."""
     observation = data["observation"].numpy()
@@ -62,19 +69,12 @@ def expected_terms(
     classifier = loss.task_classifier_params["module"]
     logits = m @ classifier["weight"].detach().numpy().T + classifier["bias"].detach().numpy()
     probability = np.exp(logits) / np.exp(logits).sum(-1, keepdims=True)
-    rows = range(data.shape[0])
-    target = np.stack(
-        [numpy_decoder(loss.teacher_generator_params[i], observation[i], latent[i]) for i in rows]
-    )
+    generators, critics = ([TensorDict.from_module(x) for x in group] for group in teachers)
+    target = np.stack(list(map(numpy_decoder, generators, observation, latent)))
     target_value = np.stack(
-        [
-            numpy_mlp(loss.teacher_qvalue_network_params["module"][i], observation[i], target[i])
-            for i in rows
-        ]
+        [numpy_mlp(q["module"], *row) for q, *row in zip(critics, observation, target, strict=True)]
     )[..., 0]
-    target_value = (target_value - loss.qvalue_loc.numpy()[:, None]) / (
-        loss.qvalue_scale.numpy()[:, None]
-    )
+    target_value = (target_value - LOC[:, None]) / SCALE[:, None]
     action = numpy_decoder(loss.student_generator_params, observation, latent, m)
     value = numpy_mlp(loss.student_qvalue_network_params["module"], observation, action, m)[..., 0]
     task = data["task"].numpy()[..., None]
@@ -95,14 +95,18 @@ def expected_terms(
 @pytest.mark.parametrize("context", ["current", "previous"])
 def test_terms_are_those_of_the_equations(context: str, deactivate_vmap: bool) -> None:
     weights = dict(zip(TERMS, (0.5, 2.0, 3.0, 0.25, 0.01), strict=True))
-    loss = make_distillation_loss(
+    torch.manual_seed(0)
+    teachers = make_teachers(TASKS)
+    loss = MetaDistillationLoss(
+        *make_student_networks(TASKS, torch.float64),
+        *teachers,
+        latent_dim=LATENT_DIM,
         context=context,
         context_fraction=1.0,
         reduction="none",
         latent_clip=None,
         deactivate_vmap=deactivate_vmap,
-        qvalue_loc=torch.tensor([0.5, -1.0, 2.0]),
-        qvalue_scale=torch.tensor([1.0, 4.0, 0.5]),
+        **NORMALISATION,
         **{f"{name}_weight": weight for name, weight in weights.items()},
     )
     data = task_transitions(TASKS, ROWS)
@@ -112,7 +116,8 @@ def test_terms_are_those_of_the_equations(context: str, deactivate_vmap: bool) -
     assert latent.shape == (TASKS, ROWS, LATENT_DIM)
     assert len(latent.flatten(0, 1).unique(dim=0)) == TASKS * ROWS
     # The teachers are recomputed from the student's z: the same for both, and teacher i in row i.
-    terms = expected_terms(loss, data, latent, data["previous"] if context == "previous" else data)
+    transition = data["previous"] if context == "previous" else data
+    terms = expected_terms(loss, teachers, data, latent, transition)
     for name, weight in weights.items():
         assert losses[f"loss_{name}"].shape == (TASKS, ROWS)
         np.testing.assert_allclose(
@@ -126,18 +131,19 @@ def test_swapped_teachers_change_the_targets_with_them() -> None:
     values = []
     for order in ([0, 1, 2], [2, 0, 1]):
         torch.manual_seed(0)
+        teachers = [generators[i] for i in order], [critics[i] for i in order]
         loss = MetaDistillationLoss(
             *make_student_networks(TASKS, torch.float64),
-            [generators[i] for i in order],
-            [critics[i] for i in order],
+            *teachers,
             latent_dim=LATENT_DIM,
             context="current",
             reduction="none",
+            **NORMALISATION,
         )
         data = task_transitions(TASKS, ROWS)
         calls = recorded(loss.student_generator.module)
         losses = loss(data)
-        terms = expected_terms(loss, data, calls[0][0][1], data)
+        terms = expected_terms(loss, teachers, data, calls[0][0][1], data)
         for name in ("generator", "qvalue"):
             np.testing.assert_allclose(losses[f"loss_{name}"].detach(), terms[name], rtol=1e-8)
         values.append(losses)
@@ -289,10 +295,6 @@ def encode(loss: MetaDistillationLoss, transition: TensorDict) -> Tensor:
     return loss.task_encoder(transition.select(*keys))["task_latent"]
 
 
-def from_current(latent: Tensor, current: Tensor) -> Tensor:
-    return (latent == current).all(-1)
-
-
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 1.0])
 def test_previous_context_embeds_the_previous_transition_on_the_chosen_share(
     fraction: float,
@@ -300,8 +302,8 @@ def test_previous_context_embeds_the_previous_transition_on_the_chosen_share(
     loss = make_distillation_loss(context="previous", context_fraction=fraction)
     data = task_transitions(TASKS, 400)
     latent = loss.embed(data)
-    current = from_current(latent, encode(loss, data))
-    previous = from_current(latent, encode(loss, data["previous"]))
+    current = (latent == encode(loss, data)).all(-1)
+    previous = (latent == encode(loss, data["previous"])).all(-1)
     assert (current ^ previous).all()
     for row in previous.double().mean(-1):
         assert row.item() == pytest.approx(fraction, abs=0.1)
@@ -310,7 +312,9 @@ def test_previous_context_embeds_the_previous_transition_on_the_chosen_share(
 def identity_loss(context: str, **options: Any) -> MetaDistillationLoss:
     """Its encoder returns the observation, so that an embedding tells which rows it is made of."""
     _, classifier, generator, critic = make_student_networks(TASKS, torch.float64)
-    encoder = per_row(lambda observation: observation)
+    encoder = TensorDictModule(
+        lambda observation: observation, in_keys=["observation"], out_keys=["task_latent"]
+    )
     return MetaDistillationLoss(
         encoder,
         classifier,

@@ -38,7 +38,7 @@ TABLE_SIZE = (0.8, 0.8, 0.05)
 TABLE_TOP = np.array([0.0, 0.0, 0.8])
 """Centre of the table's surface [m]; +x points away from the robot, +y to its left."""
 CUBE_HALF_SIZE = 0.021
-CUBE_RANGE = 0.10
+CUBE_RANGE = 0.08
 """The cube starts within this distance of the table's centre along x and along y [m]."""
 HOVER_HEIGHT = 0.10
 """Height of the gripper above the cube's centre at the start of lift and push [m]."""
