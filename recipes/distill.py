@@ -21,9 +21,10 @@ from torch import Tensor
 
 from torchrl_bmrl.agents import Student, load_bcq_loss
 from torchrl_bmrl.checkpoint import load_checkpoint, load_state, save_checkpoint
-from torchrl_bmrl.data import make_multi_task_replay_buffer
+from torchrl_bmrl.data import make_multi_task_replay_buffer, with_previous
 from torchrl_bmrl.data.demonstrations import load_transitions, read_statistics
 from torchrl_bmrl.modules import BCQPolicy
+from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.objectives import BCQLoss, MetaDistillationLoss
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
 from torchrl_bmrl.runs import check_finite, log_metrics, make_logger
@@ -70,6 +71,8 @@ def train_student(config: Config, report: Report) -> None:
         ]
         for split in ("train", "valid")
     )
+    if settings.context == "previous":
+        train = [with_previous(data, TRANSITION_KEYS) for data in train]
     buffer = make_multi_task_replay_buffer(train, batch_size=settings.batch_size)
 
     torch.manual_seed(derive_seed(config.seed, "distill"))

@@ -9,12 +9,11 @@ from pathlib import Path
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_bmrl.data.replay import stack_episodes, with_previous
+from torchrl_bmrl.data.replay import stack_episodes
 from torchrl_bmrl.data.robomimic import read_demonstrations
 from torchrl_bmrl.envs.transforms import ObservationStatistics, transform_data
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.files import write_atomic
-from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.names import TASKS, check_task
 
 
@@ -60,7 +59,7 @@ def read_statistics(data_dir: Path) -> ObservationStatistics:
 def load_transitions(
     data_dir: Path, task: str, statistics: ObservationStatistics, *, split: str, num_task: int
 ) -> TensorDictBase:
-    """A task's transitions, normalised, each with its predecessor under ``"previous"``.
+    """A task's transitions, normalised.
 
     Args:
         data_dir: folder of the demonstrations.
@@ -74,5 +73,4 @@ def load_transitions(
         :func:`~torchrl_bmrl.data.stack_episodes`.
     """
     episodes = read_demonstrations(demonstration_path(data_dir, task), split=split)
-    data = transform_data(stack_episodes(episodes, task=num_task), statistics)
-    return with_previous(data, TRANSITION_KEYS)
+    return transform_data(stack_episodes(episodes, task=num_task), statistics)
