@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,9 +41,17 @@ class EpisodeJob:
     gains: ExpertGains = field(default_factory=ExpertGains)
 
 
-@functools.cache
+_kept: SawyerEnv | None = None
+
+
 def _env(task: str) -> SawyerEnv:
-    return SawyerEnv(task)  # costs a second: kept for the worker's life
+    # Building one costs a second, keeping all six a gigabyte a worker: the last one is kept.
+    global _kept
+    if _kept is None or _kept.task != task:
+        if _kept is not None:
+            _kept.close()
+        _kept = SawyerEnv(task)
+    return _kept
 
 
 def collect_episode(task: str, seed: int, *, noise: float, gains: ExpertGains) -> Episode:
