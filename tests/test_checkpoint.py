@@ -241,7 +241,7 @@ def test_safetensors_of_another_program_are_refused_by_name(path: Path) -> None:
     from safetensors.torch import save_file
 
     path.parent.mkdir()
-    for header in (None, {"format": "pt"}, {"metadata": "{}", "state": "not json"}):
+    for header in (None, {"format": "pt"}, {"checkpoint": "not json"}, {"checkpoint": "{}"}):
         save_file({"a": torch.ones(2)}, path, header)
         refused(path, "not a whole checkpoint")
 

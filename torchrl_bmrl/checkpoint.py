@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torchrl_bmrl.errors import CheckpointError
 from torchrl_bmrl.files import write_atomic
 
+_HEADER = "checkpoint"
 _TENSOR, _PAIRS = "__tensor__", "__pairs__"
 
 
@@ -35,11 +36,9 @@ def save_checkpoint(path: Path, state: Mapping[str, Any], metadata: Mapping[str,
         {'step': 3, 'weights': tensor([1., 1.])}
     """
     tensors: dict[str, Tensor] = {}
-    header = {
-        "state": json.dumps(_encode(state, "", tensors)),
-        "metadata": json.dumps(dict(metadata)),
-    }
-    write_atomic(path, safetensors.torch.save(tensors, header))
+    header = {"state": _encode(state, "", tensors), "metadata": dict(metadata)}
+    # One entry: safetensors orders several at random, and equal runs would differ in bytes.
+    write_atomic(path, safetensors.torch.save(tensors, {_HEADER: json.dumps(header)}))
 
 
 def load_checkpoint(path: Path, *, kind: str) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -60,10 +59,10 @@ def load_checkpoint(path: Path, *, kind: str) -> tuple[dict[str, Any], dict[str,
         raise CheckpointError(path, "no such checkpoint")
     try:
         with safetensors.safe_open(path, "pt") as file:
-            header = file.metadata() or {}
+            header = json.loads((file.metadata() or {})[_HEADER])
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        metadata = json.loads(header["metadata"])
-        state = _decode(json.loads(header["state"]), tensors)
+        metadata = header["metadata"]
+        state = _decode(header["state"], tensors)
     except (safetensors.SafetensorError, KeyError, ValueError, OSError) as error:
         raise CheckpointError(
             path, f"not a whole checkpoint of this library in safetensors format ({error})"

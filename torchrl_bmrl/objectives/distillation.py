@@ -21,6 +21,7 @@ from torchrl_bmrl.functional import (
     squared_error,
 )
 
+REDUCTIONS = ("mean", "sum", "none")
 CONTEXTS = ("current", "previous", "random", "set")
 
 
@@ -69,7 +70,7 @@ class MetaDistillationLoss(LossModule):
         context_fraction: share of each batch whose m comes from ``context``; the rest is
             ``"current"``.
         context_size: transitions in a set.
-        detach_task_latent: cross-entropy alone trains M.
+        detach_task_latent: cross-entropy (and the penalty on m) alone train M.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
         deactivate_vmap: run the teachers in a loop.
         use_prioritized_weights: as in TorchRL's losses.
@@ -195,6 +196,8 @@ class MetaDistillationLoss(LossModule):
                 f"{len(teacher_generators)} teacher_generators and {len(teacher_qvalue_networks)} "
                 "teacher_qvalue_networks; valid: one of each per task"
             )
+        if reduction not in REDUCTIONS:
+            raise UnknownNameError("reduction", reduction, REDUCTIONS)
         if context not in CONTEXTS:
             raise UnknownNameError("context", context, CONTEXTS)
         if not 0.0 <= context_fraction <= 1.0:
