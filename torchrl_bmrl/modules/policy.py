@@ -91,7 +91,7 @@ class BCQPolicy(TensorDictModuleBase):
         Later updates of the loss do not reach the policy.
         """
         generator = _instantiate(loss.generator, loss.generator_params)
-        critic = _instantiate(loss.qvalue_network, loss.qvalue_network_params[0])
+        critic = _instantiate(*loss.critic(0))
         perturbation = loss.perturbation_network
         if perturbation is not None:
             perturbation = _instantiate(perturbation, loss.perturbation_network_params)

@@ -1,0 +1,489 @@
+"""What the losses of this library have in common; docs/extending.md shows how to build on it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeVar
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.objectives.common import LossModule
+from torchrl.objectives.utils import (
+    ValueEstimators,
+    _vmap_func,
+    dispatch_value_estimator,
+)
+from torchrl.objectives.value import ValueEstimatorBase
+
+from torchrl_bmrl.errors import BMRLError, UnknownNameError
+
+LOSS_FUNCTIONS = ("l2", "l1", "smooth_l1")
+REDUCTIONS = ("mean", "sum", "none")
+
+Self = TypeVar("Self", bound="OfflineLoss")
+
+
+class OfflineLoss(LossModule):
+    """Base of losses that learn one critic, or an ensemble of them, from a fixed batch.
+
+    It brings the critics (:meth:`convert_critics`), the value estimators, the reduction with masks
+    and priority weights, and the checks of the data. A subclass declares its keys, converts its
+    networks, and writes one method per loss and a ``forward``.
+
+    Keyword Args:
+        gamma: discount of the default TD(0) estimator.
+        loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"`` (Huber) between value and target.
+        separate_losses: parameters that a network shares with the ``generator`` are trained by
+            the generator's loss alone.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        deactivate_vmap: run the critics in a loop and not under :func:`torch.vmap`.
+        use_prioritized_weights: ``True``, ``False`` or ``"auto"``, as in TorchRL's losses.
+
+    Raises:
+        UnknownNameError: for another ``loss_function`` or ``reduction``.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` can rename.
+
+        Attributes:
+            action: action of the data.
+            state_action_value: the critics' output.
+            reward: under ``"next"``.
+            done: under ``"next"``.
+            terminated: under ``"next"``; only this stops the bootstrap.
+            priority: written to the input.
+            priority_weight: read from the input where present.
+        """
+
+        action: NestedKey = "action"
+        state_action_value: NestedKey = "state_action_value"
+        reward: NestedKey = "reward"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+        priority: NestedKey = "td_error"
+        priority_weight: NestedKey = "priority_weight"
+
+    tensor_keys: Any
+    default_keys: Any = _AcceptedKeys
+    default_value_estimator = ValueEstimators.TD0
+    SUPPORTED_VALUE_ESTIMATORS: ClassVar = (
+        ValueEstimators.TD0,
+        ValueEstimators.TD1,
+        ValueEstimators.TDLambda,
+    )
+
+    qvalue_network: TensorDictModule
+    qvalue_network_params: TensorDictParams
+    target_qvalue_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        *,
+        gamma: float = 0.99,
+        loss_function: str = "l2",
+        separate_losses: bool = False,
+        reduction: str = "mean",
+        deactivate_vmap: bool = False,
+        use_prioritized_weights: str | bool = "auto",
+    ) -> None:
+        super().__init__()
+        if loss_function not in LOSS_FUNCTIONS:
+            raise UnknownNameError("loss_function", loss_function, LOSS_FUNCTIONS)
+        if reduction not in REDUCTIONS:
+            raise UnknownNameError("reduction", reduction, REDUCTIONS)
+        self._in_keys: list[NestedKey] | None = None
+        self._out_keys: list[str] | None = None
+        self._vmap_qvalue_network: Any = None
+        self.gamma = gamma
+        self.loss_function = loss_function
+        self.separate_losses = separate_losses
+        self.reduction = reduction
+        self.deactivate_vmap = deactivate_vmap
+        self.use_prioritized_weights = use_prioritized_weights
+
+    # -- construction ----------------------------------------------------------------------------
+
+    def register_coefficients(self, **values: float | None) -> None:
+        """Makes hyper-parameters buffers of the networks' type and device; ``None`` stays so."""
+        reference = next(self.parameters())
+        for name, value in values.items():
+            self.register_coeff_buffer(name, value, device=reference.device, dtype=reference.dtype)
+
+    def convert_critics(
+        self,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        num_qvalue_nets: int | None,
+        *,
+        default: int = 2,
+    ) -> None:
+        """Takes over the critics and makes their targets; call it after all other networks.
+
+        Args:
+            qvalue_network: list of critics, each with an initialisation of its own, or one critic,
+                which is then copied ``num_qvalue_nets`` times and initialised anew in each copy.
+            num_qvalue_nets: number of critics; ``None`` for the length of the list, or ``default``.
+            default: number of critics made from a single one.
+
+        Raises:
+            BMRLError: for no critics, a number that is not the list's length, or a single critic
+                that cannot be initialised anew.
+        """
+        if isinstance(qvalue_network, (list, tuple)):
+            critics = list(qvalue_network)
+            if not critics or num_qvalue_nets not in (None, len(critics)):
+                raise BMRLError(
+                    f"qvalue_network is a list of {len(critics)} critics and num_qvalue_nets is "
+                    f"{num_qvalue_nets}; valid: at least one critic, and their number or None"
+                )
+        else:
+            count = default if num_qvalue_nets is None else num_qvalue_nets
+            if count < 1:
+                raise BMRLError(f"num_qvalue_nets is {count}; valid: at least 1")
+            critics = [qvalue_network, *(_renewed(qvalue_network) for _ in range(count - 1))]
+        self.num_qvalue_nets = len(critics)
+        owners = [id(p) for critic in critics for p in critic.parameters()]
+        known = {id(p) for p in self.parameters()}
+        # Stacking makes new parameters, so critics that share some with each other or with
+        # another network stay apart; of a list of one, TorchRL would make no parameters at all.
+        self._stacked = (
+            len(critics) > 1 and len(set(owners)) == len(owners) and known.isdisjoint(owners)
+        )
+        if self._stacked:
+            self.convert_to_functional(
+                critics,
+                "qvalue_network",
+                expand_dim=len(critics),
+                create_target_params=True,
+            )
+        else:
+            self.convert_to_functional(
+                _Ensemble(critics), "qvalue_network", create_target_params=True
+            )
+
+    def finish(self) -> None:
+        """Ends a subclass's ``__init__``: value estimator and vmap."""
+        self.make_value_estimator(self.default_value_estimator)
+        self._make_vmap()
+        generator = self._modules.get("generator_params")
+        own = set() if generator is None else {id(p) for p in generator.parameters()}
+        self._shared_with_generator = {
+            name: [
+                key
+                for key, value in params.items(include_nested=True, leaves_only=True)
+                if name != "generator_params" and id(value) in own
+            ]
+            for name, params in self.named_children()
+            if isinstance(params, TensorDictParams)
+        }
+
+    def _make_vmap(self) -> None:
+        if getattr(self, "_stacked", False):
+            self._vmap_qvalue_network = _vmap_func(
+                self.qvalue_network,
+                (None, 0),
+                randomness=self.vmap_randomness,
+                pseudo_vmap=self.deactivate_vmap,
+            )
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A function made by vmap cannot be pickled, and a copy must not run the original's network.
+        return self.__dict__ | {"_vmap_qvalue_network": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._make_vmap()
+
+    def critic(self, index: int = 0) -> tuple[TensorDictModule, TensorDictBase]:
+        """One critic: its module and the parameters that belong into it."""
+        if self._stacked:
+            return self.qvalue_network, self.qvalue_network_params[index]
+        params = self.qvalue_network_params["critics", str(index)]
+        return self.qvalue_network.critics[index], params
+
+    def trained(self, name: str) -> TensorDictParams | TensorDictBase:
+        """Parameters of a network as its own loss trains them, see ``separate_losses``."""
+        params = getattr(self, name)
+        shared = self._shared_with_generator[name] if self.separate_losses else []
+        if not shared:
+            return params
+        params = TensorDict(params.flatten_keys(".").to_dict()).unflatten_keys(".")
+        return params.update({key: params[key].detach() for key in shared})
+
+    def call(
+        self, name: str, tensordict: TensorDictBase, params: TensorDictBase | None = None
+    ) -> TensorDictBase:
+        """Runs a network of this loss with its own or the given parameters."""
+        module = getattr(self, name)
+        params = getattr(self, f"{name}_params") if params is None else params
+        with params.to_module(module, preserve_module_state=False):
+            return module(tensordict)
+
+    def qvalue(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
+        """Q of each critic with the given parameters, ``(num_qvalue_nets, *B)``."""
+        inputs = tensordict.select(*self.qvalue_network.in_keys)
+        if self._stacked:
+            output = self._vmap_qvalue_network(inputs, params)
+        else:
+            output = self.call("qvalue_network", inputs, params)
+        key = self.tensor_keys.state_action_value
+        value = output.get(key)
+        if value.shape[-1] != 1:
+            raise BMRLError(
+                f"the critics' {key!r} has the shape {tuple(value.shape)}; valid: (*B, 1)"
+            )
+        return value.squeeze(-1)
+
+    # -- keys ------------------------------------------------------------------------------------
+
+    def read_keys(self) -> Iterable[NestedKey]:
+        """Keys that the loss reads beside reward, done and terminated; duplicates are dropped."""
+        raise NotImplementedError
+
+    def written_keys(self) -> list[str]:
+        """Keys that ``forward`` returns, in order."""
+        raise NotImplementedError
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys read from the input, in a stable order."""
+        if self._in_keys is None:
+            keys = self.tensor_keys
+            ends = (next_key(key) for key in (keys.reward, keys.done, keys.terminated))
+            self._in_keys = list(dict.fromkeys([*self.read_keys(), *ends]))
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
+
+    @property
+    def out_keys(self) -> list[str]:
+        """Keys of the output, in the order of keyword dispatch."""
+        if self._out_keys is None:
+            self._out_keys = self.written_keys()
+        return self._out_keys
+
+    @out_keys.setter
+    def out_keys(self, values: list[str]) -> None:
+        self._out_keys = values
+
+    def _estimator_keys(self) -> dict[str, NestedKey]:
+        keys = self.tensor_keys
+        return {
+            "value": keys.state_action_value,
+            "reward": keys.reward,
+            "done": keys.done,
+            "terminated": keys.terminated,
+        }
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        if self._value_estimator is not None:
+            self._value_estimator.set_keys(**self._estimator_keys())
+        self._in_keys = None
+
+    # -- target, priority, reduction -------------------------------------------------------------
+
+    def make_value_estimator(
+        self: Self,
+        value_type: ValueEstimators | ValueEstimatorBase | type | None = None,
+        **hyperparams: Any,
+    ) -> Self:
+        """Chooses the estimator of the critics' target; returns the loss itself.
+
+        Args:
+            value_type: a member of ``SUPPORTED_VALUE_ESTIMATORS``, or an estimator of your own
+                (class or instance, made with ``value_network=None``: the loss writes the next
+                value into the data).
+            **hyperparams: of the estimator, such as ``gamma`` and ``lmbda``.
+        """
+        value_type = value_type or self.default_value_estimator
+        if isinstance(value_type, ValueEstimatorBase) or (
+            isinstance(value_type, type) and issubclass(value_type, ValueEstimatorBase)
+        ):
+            LossModule.make_value_estimator(self, value_type, **hyperparams)
+            self._forward_value_estimator_keys()
+            return self
+        estimator = dispatch_value_estimator(
+            self,
+            value_type,
+            supported=self.SUPPORTED_VALUE_ESTIMATORS,
+            tensor_keys=self._estimator_keys(),
+            value_network=None,
+            **hyperparams,
+        )
+        # TorchRL keeps hyper-parameters in float32; 0.99 is another number there.
+        estimator.to(next(self.parameters()))
+        for name, value in ({"gamma": self.gamma} | hyperparams).items():
+            if name in dict(estimator.named_buffers()):
+                estimator.get_buffer(name).fill_(value)
+        return self
+
+    def td_target(self, tensordict: TensorDictBase, next_value: Tensor) -> Tensor:
+        """Target of the critics from the value of the next states, ``(*B,)``, without gradient.
+
+        Raises:
+            BMRLError: for a reward or flag that is missing, not ``(*B, 1)`` or not finite.
+        """
+        keys = self.tensor_keys
+        next_value = next_value.unsqueeze(-1)
+        for key in (next_key(key) for key in (keys.reward, keys.done, keys.terminated)):
+            shape = entry(tensordict, key).shape
+            if shape != next_value.shape:
+                raise BMRLError(
+                    f"{key!r} has the shape {tuple(shape)}; valid: {tuple(next_value.shape)}, the "
+                    "action's with a last dimension of one"
+                )
+        data = tensordict.copy().set(next_key(keys.state_action_value), next_value)
+        return self.value_estimator.value_estimate(data).squeeze(-1).detach()
+
+    def reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Reduces ``(*B,)`` with the data's masks and priority weights."""
+        weights = self._maybe_get_priority_weight(tensordict)
+        return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
+
+    # -- data ------------------------------------------------------------------------------------
+
+    def batch_shape(self, tensordict: TensorDictBase) -> torch.Size:
+        """The shape ``*B`` of the data, told by the action; keyword calls have no batch size."""
+        key = self.tensor_keys.action
+        action = tensordict.get(key, None)
+        if action is None:
+            raise missing(tensordict, key)
+        return action.shape[:-1]
+
+    def rows(
+        self, tensordict: TensorDictBase, keys: Iterable[NestedKey], *, after: bool = False
+    ) -> TensorDictBase:
+        """The entries of some keys, now or ``after`` the step, with the batch size ``*B``.
+
+        Raises:
+            BMRLError: for a missing key, a number that is not finite, or another batch shape.
+        """
+        batch = self.batch_shape(tensordict)
+        result = TensorDict({}, batch_size=batch)
+        for key in keys:
+            full = next_key(key) if after else key
+            value = entry(tensordict, full)
+            if value.shape[: len(batch)] != batch:
+                raise BMRLError(
+                    f"{full!r} has the shape {tuple(value.shape)}; valid: {tuple(batch)} and its "
+                    "own dimensions, as the action has"
+                )
+            result.set(key, value)
+        return result
+
+
+def check_lmbda(lmbda: float) -> float:
+    """λ of the soft clipped double-Q.
+
+    Raises:
+        BMRLError: outside [0, 1].
+    """
+    if not 0.0 <= lmbda <= 1.0:
+        raise BMRLError(f"lmbda is {lmbda}; valid: between 0 and 1")
+    return lmbda
+
+
+def check_value_bounds(bounds: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Bounds on a value, in order.
+
+    Raises:
+        BMRLError: if the lower one is not below the upper one.
+    """
+    if bounds is not None and not bounds[0] < bounds[1]:
+        raise BMRLError(f"value_bounds are {bounds}; valid: (low, high) with low < high, or None")
+    return bounds
+
+
+def check_same_shape(key: NestedKey, value: Tensor, expected: Tensor) -> None:
+    """Refuses what would be broadcast in silence.
+
+    Raises:
+        BMRLError: naming the key and both shapes.
+    """
+    if value.shape != expected.shape:
+        raise BMRLError(
+            f"{key!r} has the shape {tuple(value.shape)}; valid: {tuple(expected.shape)}, as the "
+            "networks have it"
+        )
+
+
+def next_key(key: NestedKey) -> tuple[str, ...]:
+    """The key under ``"next"``.
+
+    Example:
+        >>> next_key("reward"), next_key(("agent", "reward"))
+        (('next', 'reward'), ('next', 'agent', 'reward'))
+    """
+    return ("next", key) if isinstance(key, str) else ("next", *key)
+
+
+def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """One entry of the data, finite.
+
+    On CPU a number that is not finite is refused; elsewhere that would wait for the device, and
+    in a compiled loss it cannot be said.
+
+    Raises:
+        BMRLError: if it is missing, or holds NaN or infinity.
+
+    Example:
+        >>> entry(TensorDict({"reward": torch.tensor([1.0])}, []), "reward")
+        tensor([1.])
+    """
+    value = tensordict.get(key, None)
+    if value is None:
+        raise missing(tensordict, key)
+    if (
+        not torch.compiler.is_compiling()
+        and value.device.type == "cpu"
+        and value.is_floating_point()
+    ):
+        finite = value.isfinite()
+        if not finite.all():
+            first = tuple((~finite).nonzero()[0].tolist())
+            raise BMRLError(
+                f"{key!r} holds {int((~finite).sum())} numbers that are not finite, the first, "
+                f"{value[first].item()}, at {first}; valid: finite numbers"
+            )
+    return value
+
+
+def missing(tensordict: TensorDictBase, key: NestedKey) -> BMRLError:
+    """The error for an entry that the data lack."""
+    present = [str(key) for key in tensordict.keys(include_nested=True, leaves_only=True)]
+    return BMRLError(f"the data have no {key!r}; they have: {', '.join(present) or 'nothing'}")
+
+
+class _Ensemble(TensorDictModuleBase):
+    """Critics that are run one after the other, their outputs stacked in front."""
+
+    def __init__(self, critics: Sequence[TensorDictModule]) -> None:
+        super().__init__()
+        self.critics = nn.ModuleList(critics)
+        self.in_keys = critics[0].in_keys
+        self.out_keys = critics[0].out_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return torch.stack([critic(tensordict.copy()) for critic in self.critics])
+
+
+def _renewed(module: TensorDictModule) -> TensorDictModule:
+    """A copy with an initialisation of its own."""
+    copy = deepcopy(module)
+    for name, part in copy.named_modules():
+        if hasattr(part, "reset_parameters"):
+            part.reset_parameters()
+        elif next(part.parameters(recurse=False), None) is not None:
+            raise BMRLError(
+                f"the critic's part {name!r}, a {type(part).__name__}, has no reset_parameters() "
+                "to initialise a copy with; valid: a list of critics, each initialised on its own"
+            )
+    return copy

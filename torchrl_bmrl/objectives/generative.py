@@ -1,0 +1,211 @@
+"""What losses share whose policy stays within a generative model of the data's actions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data.tensor_specs import Bounded, Composite, TensorSpec
+
+from torchrl_bmrl.errors import BMRLError, UnknownNameError
+from torchrl_bmrl.functional import gaussian_kl, perturbed_action, squared_error
+from torchrl_bmrl.objectives.common import OfflineLoss, check_same_shape, next_key
+
+KL_REDUCTIONS = ("mean", "sum")
+
+
+class GenerativeLoss(OfflineLoss):
+    r"""Base of losses around a conditional variational autoencoder of the data's actions.
+
+    It brings the autoencoder's own loss, :meth:`generator_loss`, and the way from a latent to an
+    action, :meth:`decode` and :meth:`perturb`. The generator has no target.
+
+    Args:
+        generator: a module with two :class:`~tensordict.nn.TensorDictModule` children: ``encoder``
+            (observation, action → ``action_latent_loc``, ``action_latent_scale``) and ``decoder``
+            (observation, ``action_latent`` → action), and ``latent_dim``, the size of z, such as
+            :class:`torchrl_bmrl.modules.ActionVAE`.
+        perturbation_network: optional module (observation, action → ``perturbation`` in [-1, 1]).
+
+    Keyword Args:
+        action_spec: bounded spec of the action. Exclusive with ``bounds``.
+        bounds: ``(low, high)`` of the action. Exclusive with ``action_spec``.
+        kl_weight: β.
+        kl_reduction: whether the divergence is the ``"mean"`` or the ``"sum"`` over the latent's
+            dimensions.
+        max_perturbation: φ.
+        **options: of :class:`~torchrl_bmrl.objectives.common.OfflineLoss`.
+
+    Raises:
+        BMRLError: for a generator without encoder, decoder and ``latent_dim``, bounds and spec
+            given together or not at all, or an unknown ``kl_reduction``.
+    """
+
+    @dataclass
+    class _AcceptedKeys(OfflineLoss._AcceptedKeys):
+        """Keys that ``set_keys`` can rename; those of the base and these.
+
+        Attributes:
+            action_latent: the VAE's z, read by the decoder.
+            action_latent_loc: mean of the encoder's posterior.
+            action_latent_scale: its standard deviation.
+            perturbation: the perturbation network's output.
+        """
+
+        action_latent: NestedKey = "action_latent"
+        action_latent_loc: NestedKey = "action_latent_loc"
+        action_latent_scale: NestedKey = "action_latent_scale"
+        perturbation: NestedKey = "perturbation"
+
+    default_keys = _AcceptedKeys
+
+    generator: TensorDictModule
+    generator_params: TensorDictParams
+    target_generator_params: TensorDictParams
+    perturbation_network: TensorDictModule | None
+    perturbation_network_params: TensorDictParams | None
+    target_perturbation_network_params: TensorDictParams | None
+    action_low: Tensor
+    action_high: Tensor
+
+    def __init__(
+        self,
+        generator: TensorDictModule,
+        perturbation_network: TensorDictModule | None,
+        *,
+        action_spec: TensorSpec | None,
+        bounds: tuple[float | Tensor, float | Tensor] | None,
+        kl_weight: float,
+        kl_reduction: str,
+        max_perturbation: float,
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        for part in ("encoder", "decoder", "latent_dim"):
+            if not hasattr(generator, part):
+                raise BMRLError(
+                    f"generator {type(generator).__name__} has no {part!r}; valid: a module with "
+                    "'encoder', 'decoder' and 'latent_dim', such as "
+                    "torchrl_bmrl.modules.ActionVAE"
+                )
+        if kl_reduction not in KL_REDUCTIONS:
+            raise UnknownNameError("kl_reduction", kl_reduction, KL_REDUCTIONS)
+        self.kl_reduction = kl_reduction
+        self.convert_to_functional(generator, "generator", create_target_params=False)
+        if perturbation_network is None:
+            self.perturbation_network = None
+        else:
+            self.convert_to_functional(
+                perturbation_network, "perturbation_network", create_target_params=True
+            )
+        reference = next(generator.parameters())
+        low, high = action_bounds(action_spec, bounds, self.tensor_keys.action)
+        self.register_buffer("action_low", low.to(reference))
+        self.register_buffer("action_high", high.to(reference))
+        self.register_coefficients(kl_weight=kl_weight, max_perturbation=max_perturbation)
+
+    @property
+    def observation_keys(self) -> list[NestedKey]:
+        """What decoder, critics and perturbation network read of a state."""
+        keys = [*self.generator.decoder.in_keys, *self.qvalue_network.in_keys]
+        if self.perturbation_network is not None:
+            keys += self.perturbation_network.in_keys
+        made = (self.tensor_keys.action_latent, self.tensor_keys.action)
+        return [key for key in dict.fromkeys(keys) if key not in made]
+
+    def read_keys(self) -> Iterable[NestedKey]:
+        """Observation and action, and the next observation."""
+        now = dict.fromkeys([*self.generator.encoder.in_keys, *self.observation_keys])
+        return [*now, self.tensor_keys.action, *map(next_key, self.observation_keys)]
+
+    # -- from a latent to an action --------------------------------------------------------------
+
+    def decode(self, observation: TensorDictBase, latent: Tensor) -> TensorDictBase:
+        """The observation with the latent and the action that the generator decodes from it."""
+        data = observation.copy().set(self.tensor_keys.action_latent, latent)
+        with self.generator_params.to_module(self.generator, preserve_module_state=False):
+            return self.generator.decoder(data)
+
+    def perturb(self, tensordict: TensorDictBase, *, target: bool = False) -> TensorDictBase:
+        """Moves the action by the perturbation network or its ``target``, if there is one."""
+        if self.perturbation_network is None:
+            return tensordict
+        keys = self.tensor_keys
+        params = (
+            self.target_perturbation_network_params
+            if target
+            else self.trained("perturbation_network_params")
+        )
+        tensordict = self.call("perturbation_network", tensordict, params)
+        action, perturbation = tensordict.get(keys.action), tensordict.get(keys.perturbation)
+        check_same_shape(keys.perturbation, perturbation, action)
+        action = perturbed_action(
+            action, perturbation, self.max_perturbation, self.action_low, self.action_high
+        )
+        return tensordict.set(keys.action, action)
+
+    # -- loss ------------------------------------------------------------------------------------
+
+    def generator_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Variational autoencoder's loss; gradients reach the generator alone.
+
+        Returns:
+            the loss and, detached, ``reconstruction_error`` and ``kl_divergence``.
+        """
+        keys = self.tensor_keys
+        data = self.rows(
+            tensordict,
+            dict.fromkeys([*self.generator.encoder.in_keys, *self.observation_keys, keys.action]),
+        )
+        action = data.get(keys.action)
+        with self.generator_params.to_module(self.generator, preserve_module_state=False):
+            data = self.generator.encoder(data)
+            loc, scale = data.get(keys.action_latent_loc), data.get(keys.action_latent_scale)
+            data.set(keys.action_latent, loc + scale * torch.randn_like(scale))
+            reconstruction = self.generator.decoder(data).get(keys.action)
+        check_same_shape(keys.action, action, reconstruction)
+        error = squared_error(reconstruction, action) / action.shape[-1]
+        divergence = gaussian_kl(loc, scale)
+        divergence = divergence.sum(-1) if self.kl_reduction == "sum" else divergence.mean(-1)
+        loss = self.reduce(error + self.kl_weight * divergence, tensordict)
+        self._clear_weakrefs(tensordict, data, "generator_params")
+        return loss, {
+            "reconstruction_error": error.detach().mean(),
+            "kl_divergence": divergence.detach().mean(),
+        }
+
+
+def action_bounds(
+    action_spec: TensorSpec | None,
+    bounds: tuple[float | Tensor, float | Tensor] | None,
+    action_key: NestedKey,
+) -> tuple[Tensor, Tensor]:
+    """Lower and upper bound of the action from exactly one of the two.
+
+    Raises:
+        BMRLError: for both or neither, a spec without bounds, or bounds in the wrong order.
+
+    Example:
+        >>> action_bounds(None, (-1.0, 1.0), "action")
+        (tensor(-1.), tensor(1.))
+    """
+    if (action_spec is None) == (bounds is None):
+        raise BMRLError(
+            "give either action_spec or bounds; got " + ("neither" if bounds is None else "both")
+        )
+    if bounds is None:
+        if isinstance(action_spec, Composite):
+            action_spec = action_spec[action_key]
+        if not isinstance(action_spec, Bounded):
+            raise BMRLError(f"action_spec is a {type(action_spec).__name__}; valid: Bounded")
+        bounds = (action_spec.space.low, action_spec.space.high)
+    low, high = (torch.as_tensor(bound) for bound in bounds)
+    if (low > high).any():
+        raise BMRLError(f"the lower bound {low} of the action is above the upper bound {high}")
+    return low, high
