@@ -5,6 +5,8 @@ Leading dimensions are written ``*B``. Every function is differentiable in its t
 References:
     BCQ: Fujimoto et al., *Off-Policy Deep Reinforcement Learning without Exploration*, ICML 2019,
     https://arxiv.org/abs/1812.02900.
+    Discrete BCQ: Fujimoto et al., *Benchmarking Batch Deep Reinforcement Learning Algorithms*, 2019,
+    https://arxiv.org/abs/1910.01708.
     Meta-distillation: *Compositional Skill Learning Using Batch Meta RL*, section 6.2.
 """
 
@@ -131,6 +133,28 @@ def bcq_next_value(state_action_value: Tensor, lmbda: float | Tensor) -> Tensor:
     return soft_clipped_value(state_action_value, lmbda).amax(-1)
 
 
+def likely_actions(logits: Tensor, threshold: float | Tensor) -> Tensor:
+    r"""Actions that are likely enough, measured by the likeliest one.
+
+    .. math:: \frac{G(a|s)}{\max_{a'} G(a'|s)} > \tau
+
+    Reference: discrete BCQ.
+
+    Args:
+        logits: of the behaviour's classifier, ``(*B, num_actions)``.
+        threshold: τ in [0, 1]. The likeliest action is always one of them.
+
+    Returns:
+        boolean, ``(*B, num_actions)``.
+
+    Example:
+        >>> likely_actions(torch.tensor([0.6, 0.3, 0.1]).log(), 0.3)
+        tensor([ True,  True, False])
+    """
+    ratio = (logits - logits.amax(-1, keepdim=True)).exp()
+    return (ratio > threshold) | (ratio == 1)
+
+
 def squared_error(prediction: Tensor, target: Tensor) -> Tensor:
     r"""Squared Euclidean distance, :math:`\lVert \hat g - g \rVert_2^2`.
 
@@ -146,6 +170,34 @@ def squared_error(prediction: Tensor, target: Tensor) -> Tensor:
         tensor(5.)
     """
     return (prediction - target).square().sum(-1)
+
+
+def triplet_error(anchor: Tensor, positive: Tensor, negative: Tensor, margin: float) -> Tensor:
+    r"""How far an embedding is from having its own kind nearer than others by a margin.
+
+    .. math:: \max(0,\ \lVert m - m^+ \rVert - \lVert m - m^- \rVert + \alpha)
+
+    Reference: Li et al., *Multi-task Batch Reinforcement Learning with Metric Learning*, NeurIPS
+    2020, https://arxiv.org/abs/1909.11373.
+
+    Args:
+        anchor: m, ``(*B, n)``.
+        positive: an embedding of the same task, ``(*B, n)``.
+        negative: an embedding of another task, ``(*B, n)``.
+        margin: α, in units of m.
+
+    Returns:
+        ``(*B,)``.
+
+    Example:
+        >>> a, near, far = torch.zeros(2), torch.tensor([1.0, 0.0]), torch.tensor([0.0, 3.0])
+        >>> triplet_error(a, near, far, 1.0), triplet_error(a, far, near, 1.0)
+        (tensor(0.), tensor(3.))
+    """
+    # Not of the same point: the distance has no gradient there.
+    near = (anchor - positive + 1e-6).norm(dim=-1)
+    far = (anchor - negative + 1e-6).norm(dim=-1)
+    return (near - far + margin).relu()
 
 
 def direction_error(prediction: Tensor, target: Tensor) -> Tensor:

@@ -3,10 +3,11 @@
 from torchrl_bmrl.modules.generator import (
     ActionVAE,
     make_decoder,
+    make_latent_actor,
     make_perturbation_network,
     make_qvalue_network,
 )
-from torchrl_bmrl.modules.policy import BCQPolicy
+from torchrl_bmrl.modules.policy import BCQPolicy, DiscreteBCQPolicy, PLASPolicy
 from torchrl_bmrl.modules.task_latent import (
     DemonstrationTaskLatent,
     OnlineTaskLatent,
@@ -20,9 +21,12 @@ __all__ = [
     "ActionVAE",
     "BCQPolicy",
     "DemonstrationTaskLatent",
+    "DiscreteBCQPolicy",
     "OnlineTaskLatent",
+    "PLASPolicy",
     "PrototypeTaskLatent",
     "make_decoder",
+    "make_latent_actor",
     "make_perturbation_network",
     "make_qvalue_network",
     "make_task_classifier",

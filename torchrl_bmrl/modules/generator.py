@@ -171,12 +171,13 @@ def make_qvalue_network(
 
 
 class _Tanh(nn.Module):
-    def __init__(self, network: nn.Module) -> None:
+    def __init__(self, network: nn.Module, scale: float = 1.0) -> None:
         super().__init__()
         self.network = network
+        self.scale = scale
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        return self.network(*inputs).tanh()
+        return self.scale * self.network(*inputs).tanh()
 
 
 def make_perturbation_network(
@@ -190,3 +191,23 @@ def make_perturbation_network(
     """
     network = _Tanh(make_mlp(observation_dim + action_dim, action_dim, num_cells))
     return TensorDictModule(network, in_keys=["observation", "action"], out_keys=["perturbation"])
+
+
+def make_latent_actor(
+    observation_dim: int,
+    latent_dim: int,
+    *,
+    num_cells: Sequence[int] = (256, 256),
+    max_latent: float = 2.0,
+) -> TensorDictModule:
+    """Policy in the latent action space: observation to ``action_latent (*B, latent_dim)``.
+
+    Reference: Zhou et al. 2020, https://arxiv.org/abs/2011.07213; as published, every dimension is
+    squashed into ±``max_latent``, in standard deviations of the prior.
+
+    Example:
+        >>> make_latent_actor(3, 4).out_keys
+        ['action_latent']
+    """
+    network = _Tanh(make_mlp(observation_dim, latent_dim, num_cells), max_latent)
+    return TensorDictModule(network, in_keys=["observation"], out_keys=["action_latent"])

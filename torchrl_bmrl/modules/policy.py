@@ -9,9 +9,10 @@ import torch
 from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.functional import perturbed_action, sample_action_latent
+from torchrl_bmrl.functional import likely_actions, perturbed_action, sample_action_latent
 
 if TYPE_CHECKING:
     from torchrl.objectives import LossModule
@@ -90,15 +91,11 @@ class BCQPolicy(TensorDictModuleBase):
 
         Later updates of the loss do not reach the policy.
         """
-        generator = _instantiate(loss.generator, loss.generator_params)
-        critic = _instantiate(*loss.critic(0))
-        perturbation = loss.perturbation_network
-        if perturbation is not None:
-            perturbation = _instantiate(perturbation, loss.perturbation_network_params)
+        generator = _network(loss, "generator")
         return cls(
             generator.decoder,
-            critic,
-            perturbation,
+            _instantiate(*loss.critic(0)),
+            _network(loss, "perturbation_network"),
             latent_dim=generator.latent_dim,
             num_candidates=num_candidates,
             latent_clip=None if loss.latent_clip is None else float(loss.latent_clip),
@@ -133,6 +130,155 @@ class BCQPolicy(TensorDictModuleBase):
         action = proposals.get("action")
         best = best.expand(*best.shape[:-1], action.shape[-1])
         return tensordict.set("action", action.gather(-2, best).squeeze(-2))
+
+
+class PLASPolicy(TensorDictModuleBase):
+    r"""The action decoded from the latent that a policy chooses.
+
+    .. math:: \mu(s) = a + \phi\,\xi(s, a),\quad a = G(s, \pi(s))
+
+    Reference: Zhou et al. 2020, https://arxiv.org/abs/2011.07213.
+
+    Args:
+        actor_network: (observation) → ``action_latent``.
+        decoder: (observation, ``action_latent``) → ``action``.
+        perturbation_network: optional (observation, ``action``) → ``perturbation``.
+
+    Keyword Args:
+        max_perturbation: φ.
+        bounds: of the action, used with a perturbation network.
+
+    Keys read: ``observation (*B, obs_dim)``. Key written: ``action (*B, action_dim)``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_bmrl.modules import ActionVAE, make_latent_actor
+        >>> policy = PLASPolicy(make_latent_actor(3, 4), ActionVAE(3, 2).decoder)
+        >>> policy(TensorDict({"observation": torch.zeros(5, 3)}, [5]))["action"].shape
+        torch.Size([5, 2])
+    """
+
+    action_low: Tensor
+    action_high: Tensor
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        decoder: TensorDictModule,
+        perturbation_network: TensorDictModule | None = None,
+        *,
+        max_perturbation: float = 0.05,
+        bounds: tuple[float | Tensor, float | Tensor] = (-1.0, 1.0),
+    ) -> None:
+        super().__init__()
+        self.actor_network = actor_network
+        self.decoder = decoder
+        self.perturbation_network = perturbation_network
+        self.max_perturbation = max_perturbation
+        low, high = (torch.as_tensor(bound) for bound in bounds)
+        self.register_buffer("action_low", low)
+        self.register_buffer("action_high", high)
+        self.in_keys = list(actor_network.in_keys)
+        self.out_keys = ["action"]
+
+    @classmethod
+    def from_loss(cls, loss: LossModule) -> PLASPolicy:
+        """Policy of a trained :class:`~torchrl_bmrl.objectives.PLASLoss`, as a copy."""
+        generator, actor, perturbation = (
+            _network(loss, name) for name in ("generator", "actor_network", "perturbation_network")
+        )
+        return cls(
+            actor,
+            generator.decoder,
+            perturbation,
+            max_perturbation=float(loss.max_perturbation),
+            bounds=(loss.action_low, loss.action_high),
+        )
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes ``action``."""
+        data = self.decoder(self.actor_network(tensordict.select(*self.in_keys)))
+        action = data.get("action")
+        if self.perturbation_network is not None:
+            perturbation = self.perturbation_network(data).get("perturbation")
+            action = perturbed_action(
+                action, perturbation, self.max_perturbation, self.action_low, self.action_high
+            )
+        return tensordict.set("action", action)
+
+
+class DiscreteBCQPolicy(TensorDictModuleBase):
+    r"""The most valuable of the actions that are likely enough.
+
+    .. math:: \pi(s) = \arg\max_a \{Q_1(s, a) : G(a|s) / \max_{a'} G(a'|s) > \tau\}
+
+    Reference: Fujimoto et al. 2019, https://arxiv.org/abs/1910.01708.
+
+    Args:
+        generator: classifier of the data's actions (observation) → ``logits``.
+        qvalue_network: (observation) → ``action_value``.
+
+    Keyword Args:
+        threshold: τ. Default 0.3.
+        action_space: ``"one-hot"``, written as ``(*B, n)``, or ``"categorical"``, ``(*B,)``.
+
+    Keys read: ``observation``. Key written: ``action``, int64.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules import MLP
+        >>> generator, critic = (
+        ...     TensorDictModule(MLP(3, 4), in_keys=["observation"], out_keys=[key])
+        ...     for key in ("logits", "action_value")
+        ... )
+        >>> policy = DiscreteBCQPolicy(generator, critic)
+        >>> policy(TensorDict({"observation": torch.zeros(5, 3)}, [5]))["action"].sum(-1)
+        tensor([1, 1, 1, 1, 1])
+    """
+
+    def __init__(
+        self,
+        generator: TensorDictModule,
+        qvalue_network: TensorDictModule,
+        *,
+        threshold: float = 0.3,
+        action_space: str = "one-hot",
+    ) -> None:
+        super().__init__()
+        self.generator = generator
+        self.qvalue_network = qvalue_network
+        self.threshold = threshold
+        self.action_space = action_space
+        self.in_keys = list(dict.fromkeys([*generator.in_keys, *qvalue_network.in_keys]))
+        self.out_keys = ["action"]
+
+    @classmethod
+    def from_loss(cls, loss: LossModule) -> DiscreteBCQPolicy:
+        """Policy of a trained :class:`~torchrl_bmrl.objectives.DiscreteBCQLoss`, as a copy."""
+        return cls(
+            _network(loss, "generator"),
+            _instantiate(*loss.critic(0)),
+            threshold=float(loss.threshold),
+            action_space=loss.action_space,
+        )
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes ``action``."""
+        data = self.qvalue_network(self.generator(tensordict.select(*self.in_keys)))
+        allowed = likely_actions(data.get("logits"), self.threshold)
+        value = data.get("action_value").masked_fill(~allowed, -torch.inf)
+        action = value.argmax(-1)
+        if self.action_space == "one-hot":
+            action = one_hot(action, value.shape[-1])
+        return tensordict.set("action", action)
+
+
+def _network(loss: LossModule, name: str) -> TensorDictModule | None:
+    """A stand-alone copy of one of a loss's networks; ``None`` for one that it does not have."""
+    module = getattr(loss, name)
+    return None if module is None else _instantiate(module, getattr(loss, f"{name}_params"))
 
 
 def _instantiate(module: TensorDictModule, params: TensorDictBase) -> TensorDictModule:

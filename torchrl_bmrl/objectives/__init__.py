@@ -1,6 +1,17 @@
 """Offline losses in TorchRL's contract."""
 
 from torchrl_bmrl.objectives.bcq import BCQLoss
+from torchrl_bmrl.objectives.common import OfflineLoss
+from torchrl_bmrl.objectives.discrete_bcq import DiscreteBCQLoss
 from torchrl_bmrl.objectives.distillation import MetaDistillationLoss
+from torchrl_bmrl.objectives.generative import GenerativeLoss
+from torchrl_bmrl.objectives.plas import PLASLoss
 
-__all__ = ["BCQLoss", "MetaDistillationLoss"]
+__all__ = [
+    "BCQLoss",
+    "DiscreteBCQLoss",
+    "GenerativeLoss",
+    "MetaDistillationLoss",
+    "OfflineLoss",
+    "PLASLoss",
+]

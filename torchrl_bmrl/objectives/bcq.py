@@ -7,7 +7,6 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
 from torch import Tensor
 from torchrl.data.tensor_specs import TensorSpec
-from torchrl.objectives.utils import distance_loss
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.functional import bcq_next_value, sample_action_latent
@@ -189,11 +188,9 @@ class BCQLoss(GenerativeLoss):
             next_value = bcq_next_value(candidates, self.lmbda)
             if self.value_bounds is not None:
                 next_value = next_value.clamp(*self.value_bounds)
-            target = self.td_target(tensordict, next_value)
         data = self.rows(tensordict, self.qvalue_network.in_keys)
         predicted = self.qvalue(data, self.trained("qvalue_network_params"))
-        loss = distance_loss(predicted, target.expand_as(predicted), self.loss_function).sum(0)
-        loss = self.reduce(loss, tensordict)
+        result = self.temporal_difference(tensordict, predicted, next_value)
         self._clear_weakrefs(
             tensordict,
             data,
@@ -201,12 +198,7 @@ class BCQLoss(GenerativeLoss):
             "qvalue_network_params",
             "target_qvalue_network_params",
         )
-        return loss, {
-            "td_error": (predicted - target).detach().square(),
-            "pred_value": predicted.detach().mean(),
-            "target_value": target.mean(),
-            "next_state_value": next_value.mean(),
-        }
+        return result
 
     def perturbation_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Perturbation network's loss, -Q of the first critic; gradients reach it alone.

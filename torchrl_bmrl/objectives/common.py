@@ -17,6 +17,7 @@ from torchrl.objectives.utils import (
     ValueEstimators,
     _vmap_func,
     dispatch_value_estimator,
+    distance_loss,
 )
 from torchrl.objectives.value import ValueEstimatorBase
 
@@ -225,19 +226,23 @@ class OfflineLoss(LossModule):
         with params.to_module(module, preserve_module_state=False):
             return module(tensordict)
 
-    def qvalue(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
-        """Q of each critic with the given parameters, ``(num_qvalue_nets, *B)``."""
+    def evaluate(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
+        """Outputs of all critics with the given parameters, stacked in front."""
         inputs = tensordict.select(*self.qvalue_network.in_keys)
         if self._stacked:
-            output = self._vmap_qvalue_network(inputs, params)
-        else:
-            output = self.call("qvalue_network", inputs, params)
+            return self._vmap_qvalue_network(inputs, params)
+        return self.call("qvalue_network", inputs, params)
+
+    def qvalue(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
+        """Q of each critic with the given parameters, ``(num_qvalue_nets, *B)``.
+
+        Raises:
+            BMRLError: if the critics' output is not ``(*B, 1)``.
+        """
         key = self.tensor_keys.state_action_value
-        value = output.get(key)
+        value = self.evaluate(tensordict, params).get(key)
         if value.shape[-1] != 1:
-            raise BMRLError(
-                f"the critics' {key!r} has the shape {tuple(value.shape)}; valid: (*B, 1)"
-            )
+            raise BMRLError(f"the critics' {key!r} has shape {tuple(value.shape)}; valid: (*B, 1)")
         return value.squeeze(-1)
 
     # -- keys ------------------------------------------------------------------------------------
@@ -342,6 +347,29 @@ class OfflineLoss(LossModule):
                 )
         data = tensordict.copy().set(next_key(keys.state_action_value), next_value)
         return self.value_estimator.value_estimate(data).squeeze(-1).detach()
+
+    def temporal_difference(
+        self, tensordict: TensorDictBase, predicted: Tensor, next_value: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        r"""Distance of the critics from their target, :math:`\sum_j d(Q_j(s, a), y)`.
+
+        Args:
+            tensordict: the data.
+            predicted: Q of each critic at the data's actions, ``(num_qvalue_nets, *B)``.
+            next_value: value of the next states, ``(*B,)``.
+
+        Returns:
+            the loss and, detached, ``td_error (num_qvalue_nets, *B)``, ``pred_value``,
+            ``target_value`` and ``next_state_value``.
+        """
+        target = self.td_target(tensordict, next_value)
+        distance = distance_loss(predicted, target.expand_as(predicted), self.loss_function)
+        return self.reduce(distance.sum(0), tensordict), {
+            "td_error": (predicted - target).detach().square(),
+            "pred_value": predicted.detach().mean(),
+            "target_value": target.mean(),
+            "next_state_value": next_value.detach().mean(),
+        }
 
     def reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
         """Reduces ``(*B,)`` with the data's masks and priority weights."""

@@ -127,9 +127,13 @@ class GenerativeLoss(OfflineLoss):
     # -- from a latent to an action --------------------------------------------------------------
 
     def decode(self, observation: TensorDictBase, latent: Tensor) -> TensorDictBase:
-        """The observation with the latent and the action that the generator decodes from it."""
+        """The observation with the latent and the action that the generator decodes from it.
+
+        A gradient may reach the latent, never the generator.
+        """
         data = observation.copy().set(self.tensor_keys.action_latent, latent)
-        with self.generator_params.to_module(self.generator, preserve_module_state=False):
+        params = self.generator_params.detach()
+        with params.to_module(self.generator, preserve_module_state=False):
             return self.generator.decoder(data)
 
     def perturb(self, tensordict: TensorDictBase, *, target: bool = False) -> TensorDictBase:

@@ -1,0 +1,257 @@
+"""Discrete Batch-Constrained Q-learning as a TorchRL loss module."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from torchrl_bmrl.errors import BMRLError, UnknownNameError
+from torchrl_bmrl.functional import likely_actions
+from torchrl_bmrl.objectives.common import OfflineLoss, missing, next_key
+
+ACTION_SPACES = ("one-hot", "categorical")
+
+
+class DiscreteBCQLoss(OfflineLoss):
+    r"""Discrete Batch-Constrained deep Q-learning.
+
+    A classifier :math:`G` learns which actions the data hold; the critics bootstrap only from
+    actions that are likely enough under it.
+
+    Reference: Fujimoto et al., *Benchmarking Batch Deep Reinforcement Learning Algorithms*, 2019,
+    https://arxiv.org/abs/1910.01708.
+
+    Losses, in update order:
+
+    1. :meth:`generator_loss`: :math:`-\log G(a|s) + w\, \overline{l(s)^2}`, where :math:`l` are
+       the logits, averaged over the actions
+    2. :meth:`qvalue_loss`: :math:`\sum_j d(Q_j(s, a), y)` with
+       :math:`y = r + \gamma (1 - \mathrm{terminated}) \min_j Q'_j(s', a')`,
+       :math:`a' = \arg\max_{a} \{\min_j Q_j(s', a) : G(a|s') / \max_{a} G(a|s') > \tau\}`
+
+    One critic is the published algorithm (Double DQN within the likely actions); several are
+    clipped to their minimum.
+
+    Args:
+        generator: classifier of the data's actions (observation → ``logits (*B, n)``).
+        qvalue_network: critic, or list of critics (observation → ``action_value (*B, n)``).
+
+    Keyword Args:
+        action_space: how ``action`` is written: ``"one-hot"``, ``(*B, n)``, as
+            :class:`~torchrl.envs.GymEnv` has it, or ``"categorical"``, ``(*B,)`` or ``(*B, 1)``.
+        num_qvalue_nets: number of critics; default 1 from a single one, else the list's length.
+        threshold: τ. Default 0.3. 0 is Double DQN, 1 is imitation.
+        logits_weight: w. Default 0.01.
+        loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"`` (Huber, the default).
+        gamma: discount of the default TD(0) estimator. Default 0.99.
+        separate_losses: parameters that the critics share with the generator are trained by the
+            generator's loss alone. Default ``False``, as published for a common convolution.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        deactivate_vmap: run the critics in a loop and not under :func:`torch.vmap`.
+        use_prioritized_weights: ``True``, ``False`` or ``"auto"``, as in TorchRL's losses.
+
+    Keys read: ``observation (*B, ...)``, ``action``, and under ``"next"`` ``observation``,
+    ``reward``, ``done``, ``terminated``, each of the last three ``(*B, 1)``. Key written to the
+    input: ``td_error (*B,)``, the priority.
+
+    Raises:
+        BMRLError: for a threshold outside [0, 1], no critics, an unknown ``action_space``,
+            ``loss_function`` or ``reduction``; and at a call for data with missing keys, other
+            shapes or, on CPU and not compiled, numbers that are not finite.
+
+    Example:
+        >>> from torchrl.modules import MLP
+        >>> def network(name):
+        ...     return TensorDictModule(MLP(4, 2), in_keys=["observation"], out_keys=[name])
+        >>> loss = DiscreteBCQLoss(network("logits"), network("action_value"))
+        >>> data = TensorDict(
+        ...     {
+        ...         "observation": torch.randn(8, 4),
+        ...         "action": torch.eye(2)[torch.randint(2, (8,))],
+        ...         "next": {
+        ...             "observation": torch.randn(8, 4),
+        ...             "reward": torch.randn(8, 1),
+        ...             "done": torch.zeros(8, 1, dtype=torch.bool),
+        ...             "terminated": torch.zeros(8, 1, dtype=torch.bool),
+        ...         },
+        ...     },
+        ...     batch_size=[8],
+        ... )
+        >>> losses = loss(data)
+        >>> (losses["loss_generator"] + losses["loss_qvalue"]).backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys(OfflineLoss._AcceptedKeys):
+        """Keys that ``set_keys`` can rename; those of the base and these.
+
+        Attributes:
+            logits: the generator's output.
+            action_value: the critics' output, the value of every action.
+            state_action_value: where the value of the chosen next action is written.
+        """
+
+        logits: NestedKey = "logits"
+        action_value: NestedKey = "action_value"
+        state_action_value: NestedKey = "chosen_action_value"
+
+    default_keys = _AcceptedKeys
+
+    generator: TensorDictModule
+    generator_params: TensorDictParams
+    target_generator_params: TensorDictParams
+
+    def __init__(
+        self,
+        generator: TensorDictModule,
+        qvalue_network: TensorDictModule | list[TensorDictModule],
+        *,
+        action_space: str = "one-hot",
+        num_qvalue_nets: int | None = None,
+        threshold: float = 0.3,
+        logits_weight: float = 1e-2,
+        loss_function: str = "smooth_l1",
+        gamma: float = 0.99,
+        separate_losses: bool = False,
+        reduction: str = "mean",
+        deactivate_vmap: bool = False,
+        use_prioritized_weights: str | bool = "auto",
+    ) -> None:
+        super().__init__(
+            loss_function=loss_function,
+            gamma=gamma,
+            separate_losses=separate_losses,
+            reduction=reduction,
+            deactivate_vmap=deactivate_vmap,
+            use_prioritized_weights=use_prioritized_weights,
+        )
+        if action_space not in ACTION_SPACES:
+            raise UnknownNameError("action_space", action_space, ACTION_SPACES)
+        if not 0.0 <= threshold <= 1.0:
+            raise BMRLError(f"threshold is {threshold}; valid: between 0 and 1")
+        self.action_space = action_space
+        self.convert_to_functional(generator, "generator", create_target_params=False)
+        self.register_coefficients(threshold=threshold, logits_weight=logits_weight)
+        self.convert_critics(qvalue_network, num_qvalue_nets, default=1)
+        self.finish()
+
+    def read_keys(self) -> list[NestedKey]:
+        """Observation and action, and the next observation."""
+        return [
+            *self.observation_keys,
+            self.tensor_keys.action,
+            *map(next_key, self.observation_keys),
+        ]
+
+    @property
+    def observation_keys(self) -> list[NestedKey]:
+        """What the networks read of a state."""
+        return list(dict.fromkeys([*self.generator.in_keys, *self.qvalue_network.in_keys]))
+
+    def written_keys(self) -> list[str]:
+        """Losses in update order, then metrics."""
+        return [
+            "loss_generator",
+            "loss_qvalue",
+            "cross_entropy",
+            "pred_value",
+            "target_value",
+            "next_state_value",
+        ]
+
+    # -- actions and values ----------------------------------------------------------------------
+
+    def batch_shape(self, tensordict: TensorDictBase) -> torch.Size:
+        """The shape ``*B`` of the data, told by the action."""
+        key = self.tensor_keys.action
+        action = tensordict.get(key, None)
+        if action is None:
+            raise missing(tensordict, key)
+        if self.action_space == "categorical" and action.ndim == tensordict.ndim:
+            return action.shape
+        return action.shape[:-1]
+
+    def action_index(self, tensordict: TensorDictBase, num_actions: int) -> Tensor:
+        """Index of the data's action, ``(*B,)``.
+
+        Raises:
+            BMRLError: for an action that is not written as ``action_space`` says.
+        """
+        key, batch = self.tensor_keys.action, self.batch_shape(tensordict)
+        action = tensordict.get(key)
+        width = num_actions if self.action_space == "one-hot" else 1
+        if action.shape not in (batch, (*batch, width)):
+            raise BMRLError(
+                f"{key!r} has the shape {tuple(action.shape)}; valid for action_space="
+                f"{self.action_space!r}: {(*batch, width)}"
+            )
+        if self.action_space == "one-hot":
+            return action.to(torch.uint8).argmax(-1)
+        return action.reshape(batch)
+
+    def logits(self, tensordict: TensorDictBase, *, after: bool = False) -> Tensor:
+        """Logits of the generator at the state or the one ``after``, ``(*B, n)``."""
+        data = self.rows(tensordict, self.generator.in_keys, after=after)
+        return self.call("generator", data).get(self.tensor_keys.logits)
+
+    def qvalue(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
+        """Value of every action under each critic, ``(num_qvalue_nets, *B, n)``."""
+        return self.evaluate(tensordict, params).get(self.tensor_keys.action_value)
+
+    # -- losses, in update order -----------------------------------------------------------------
+
+    def generator_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Classifier's loss; gradients reach the generator alone.
+
+        Returns:
+            the loss and, detached, ``cross_entropy``.
+        """
+        logits = self.logits(tensordict)
+        action = self.action_index(tensordict, logits.shape[-1])
+        cross_entropy = -logits.log_softmax(-1).gather(-1, action.unsqueeze(-1)).squeeze(-1)
+        loss = cross_entropy + self.logits_weight * logits.square().mean(-1)
+        loss = self.reduce(loss, tensordict)
+        self._clear_weakrefs(tensordict, "generator_params")
+        return loss, {"cross_entropy": cross_entropy.detach().mean()}
+
+    def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Critics' loss, summed over the critics; gradients reach the critics alone.
+
+        Returns:
+            the loss and, detached, ``td_error (num_qvalue_nets, *B)``, ``pred_value``,
+            ``target_value`` and ``next_state_value``.
+        """
+        with torch.no_grad():
+            after = self.rows(tensordict, self.qvalue_network.in_keys, after=True)
+            allowed = likely_actions(self.logits(tensordict, after=True), self.threshold)
+            value = self.qvalue(after, self.qvalue_network_params).amin(0)
+            best = value.masked_fill(~allowed, -torch.inf).argmax(-1, keepdim=True)
+            value = self.qvalue(after, self.target_qvalue_network_params).amin(0)
+            next_value = value.gather(-1, best).squeeze(-1)
+        data = self.rows(tensordict, self.qvalue_network.in_keys)
+        value = self.qvalue(data, self.trained("qvalue_network_params"))
+        index = self.action_index(tensordict, value.shape[-1]).expand(value.shape[:-1])
+        predicted = value.gather(-1, index.unsqueeze(-1)).squeeze(-1)
+        result = self.temporal_difference(tensordict, predicted, next_value)
+        self._clear_weakrefs(
+            tensordict,
+            data,
+            "generator_params",
+            "qvalue_network_params",
+            "target_qvalue_network_params",
+        )
+        return result
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Computes both losses with the present parameters; see the class for keys."""
+        loss_generator, generator_info = self.generator_loss(tensordict)
+        loss_qvalue, qvalue_info = self.qvalue_loss(tensordict)
+        tensordict.set(self.tensor_keys.priority, qvalue_info.pop("td_error").amax(0))
+        losses = {"loss_generator": loss_generator, "loss_qvalue": loss_qvalue}
+        return TensorDict(losses | generator_info | qvalue_info)
