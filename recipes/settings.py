@@ -14,8 +14,9 @@ from torchrl_bmrl.agents import LATENT_SOURCES
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.experts.controllers import ExpertGains
 from torchrl_bmrl.names import TASKS, check_task
-from torchrl_bmrl.objectives.bcq import LOSS_FUNCTIONS
-from torchrl_bmrl.objectives.distillation import CONTEXTS
+from torchrl_bmrl.objectives.common import LOSS_FUNCTIONS
+from torchrl_bmrl.objectives.distillation import CONTEXTS, ENCODER_TERMS
+from torchrl_bmrl.objectives.generative import KL_REDUCTIONS
 from torchrl_bmrl.runs import LOGGERS, open_run
 
 
@@ -44,11 +45,15 @@ class BCQSettings:
     lmbda: float = 0.75
     latent_clip: float | None = 0.5  # null turns it off
     kl_weight: float = 0.5
+    kl_reduction: str = "mean"  # or sum, over the latent's dimensions
     gamma: float = 0.99
     tau: float = 0.005
     perturbation: bool = False  # the paper has none
     max_perturbation: float = 0.05
-    loss_function: str = "l2"
+    value_bounds: tuple[float, float] | None = None  # of the next states' value
+    loss_function: str = "l2"  # or l1, smooth_l1 (Huber)
+    generator_warmup: int = 0  # updates of the generator alone before the critics start
+    critic_grad_clip: float | None = None  # norm of the critics' gradient
 
 
 @dataclass
@@ -64,12 +69,14 @@ class DistillSettings:
     context: str = "set"  # what m is computed from: current (the paper's), previous, random, set
     context_fraction: float = 0.5
     context_size: int = 8
-    detach_task_latent: bool = False  # True: cross-entropy alone trains the encoder
+    encoder_terms: list[str] = field(default_factory=lambda: list(ENCODER_TERMS))  # train M
     classification_weight: float = 1.0
     generator_weight: float = 1.0
     direction_weight: float = 1.0
     qvalue_weight: float = 1.0
     latent_norm_weight: float = 2e-3
+    metric_weight: float = 0.0  # of the triplet loss on m
+    metric_margin: float = 1.0
     normalise_qvalue: bool = True
     prototype: str = "mean"  # or medoid
 
@@ -120,6 +127,7 @@ POSITIVE = (
 CHOICES = {
     "logger": LOGGERS,
     "bcq.loss_function": LOSS_FUNCTIONS,
+    "bcq.kl_reduction": KL_REDUCTIONS,
     "distill.context": CONTEXTS,
     "distill.prototype": ("mean", "medoid"),
 }

@@ -17,6 +17,7 @@ import hydra
 import torch
 from omegaconf import DictConfig
 from settings import Config, run_recipe
+from torch.nn.utils import clip_grad_norm_
 from torchrl.objectives import SoftUpdate
 
 from torchrl_bmrl.agents import make_bcq_loss
@@ -38,8 +39,10 @@ LOSS_SETTINGS = (
     "lmbda",
     "latent_clip",
     "kl_weight",
+    "kl_reduction",
     "gamma",
     "max_perturbation",
+    "value_bounds",
     "loss_function",
 )
 
@@ -84,15 +87,19 @@ def train_task(job: tuple[Config, str], report: Report) -> None:
         batch = buffer.sample()
         metrics = {}
         for name, part in parts.items():  # in update order: generator, critics, perturbation
+            if name != "generator" and update <= settings.generator_warmup:
+                continue
             value, info = part(batch)
             optimizers[name].zero_grad(set_to_none=True)
             value.backward()
+            if name == "qvalue" and settings.critic_grad_clip is not None:
+                clip_grad_norm_(networks[name].parameters(), settings.critic_grad_clip)
             optimizers[name].step()
             metrics |= {f"loss_{name}": value.detach()} | info
         target_updater.step()
         report(1)
         if update % config.log_interval == 0:
-            metrics.pop("td_error")
+            metrics.pop("td_error", None)  # one number per transition
             check_finite(metrics, f"bcq {task}, update {update}")
             log_metrics(logger, metrics, update)
         if update % settings.updates_per_epoch == 0:

@@ -157,7 +157,7 @@ def test_the_presets_differ_in_what_their_names_say(recipes: Any, tmp_path: Path
     )
     assert list(paper.collect.train_episodes.values()) == [500, 500, 100, 100, 100, 100]
     assert literal.distill.context_fraction == literal.distill.latent_norm_weight == 0.0
-    assert literal.distill.detach_task_latent
+    assert literal.distill.encoder_terms == ["classification"]
     assert literal.bcq == quick.bcq
     assert configured(f"run_dir={tmp_path}") == configured("preset=quick", f"run_dir={tmp_path}")
 

@@ -5,8 +5,8 @@ Leading dimensions are written ``*B``. Every function is differentiable in its t
 References:
     BCQ: Fujimoto et al., *Off-Policy Deep Reinforcement Learning without Exploration*, ICML 2019,
     https://arxiv.org/abs/1812.02900.
-    Discrete BCQ: Fujimoto et al., *Benchmarking Batch Deep Reinforcement Learning Algorithms*, 2019,
-    https://arxiv.org/abs/1910.01708.
+    Discrete BCQ: Fujimoto et al., *Benchmarking Batch Deep Reinforcement Learning Algorithms*,
+    2019, https://arxiv.org/abs/1910.01708.
     Meta-distillation: *Compositional Skill Learning Using Batch Meta RL*, section 6.2.
 """
 
@@ -194,10 +194,7 @@ def triplet_error(anchor: Tensor, positive: Tensor, negative: Tensor, margin: fl
         >>> triplet_error(a, near, far, 1.0), triplet_error(a, far, near, 1.0)
         (tensor(0.), tensor(3.))
     """
-    # Not of the same point: the distance has no gradient there.
-    near = (anchor - positive + 1e-6).norm(dim=-1)
-    far = (anchor - negative + 1e-6).norm(dim=-1)
-    return (near - far + margin).relu()
+    return F.triplet_margin_loss(anchor, positive, negative, margin=margin, reduction="none")
 
 
 def direction_error(prediction: Tensor, target: Tensor) -> Tensor:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn.functional import one_hot
 
@@ -41,9 +42,10 @@ class BCQPolicy(TensorDictModuleBase):
         latent_clip: bound on the latent, ``None`` for none. Default 0.5.
         max_perturbation: φ.
         bounds: of the action, used with a perturbation network.
+        action_latent_key: what the decoder calls z.
 
     Keys read: ``observation (*B, obs_dim)`` (and ``task_latent (*B, m)``). Key written:
-    ``action (*B, action_dim)``.
+    ``action (*B, action_dim)``, or what the decoder calls it.
 
     Example:
         >>> from tensordict import TensorDict
@@ -68,6 +70,7 @@ class BCQPolicy(TensorDictModuleBase):
         latent_clip: float | None = 0.5,
         max_perturbation: float = 0.05,
         bounds: tuple[float | Tensor, float | Tensor] = (-1.0, 1.0),
+        action_latent_key: NestedKey = "action_latent",
     ) -> None:
         super().__init__()
         if num_candidates < 1:
@@ -82,8 +85,9 @@ class BCQPolicy(TensorDictModuleBase):
         low, high = (torch.as_tensor(bound) for bound in bounds)
         self.register_buffer("action_low", low)
         self.register_buffer("action_high", high)
-        self.in_keys = [key for key in decoder.in_keys if key != "action_latent"]
-        self.out_keys = ["action"]
+        self.action_latent_key = action_latent_key
+        self.in_keys = [key for key in decoder.in_keys if key != action_latent_key]
+        self.out_keys = [decoder.out_keys[-1]]
 
     @classmethod
     def from_loss(cls, loss: LossModule, *, num_candidates: int = 100) -> BCQPolicy:
@@ -101,11 +105,12 @@ class BCQPolicy(TensorDictModuleBase):
             latent_clip=None if loss.latent_clip is None else float(loss.latent_clip),
             max_perturbation=float(loss.max_perturbation),
             bounds=(loss.action_low, loss.action_high),
+            action_latent_key=loss.tensor_keys.action_latent,
         )
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes ``action``."""
+        """Writes the action."""
         proposals = tensordict.select(*self.in_keys).unsqueeze(-1)
         proposals = proposals.expand(*tensordict.batch_size, self.num_candidates)
         observation = proposals.get(self.in_keys[0])
@@ -115,21 +120,13 @@ class BCQPolicy(TensorDictModuleBase):
             device=observation.device,
             dtype=observation.dtype,
         )
-        proposals = self.decoder(proposals.copy().set("action_latent", latent))
-        if self.perturbation_network is not None:
-            proposals = self.perturbation_network(proposals)
-            action, perturbation = proposals.get("action"), proposals.get("perturbation")
-            proposals.set(
-                "action",
-                perturbed_action(
-                    action, perturbation, self.max_perturbation, self.action_low, self.action_high
-                ),
-            )
-        value = self.qvalue_network(proposals).get("state_action_value")
+        proposals = self.decoder(proposals.copy().set(self.action_latent_key, latent))
+        proposals = _perturb(self, proposals)
+        value = self.qvalue_network(proposals).get(self.qvalue_network.out_keys[-1])
         best = value.argmax(dim=-2, keepdim=True)
-        action = proposals.get("action")
+        action = proposals.get(self.out_keys[0])
         best = best.expand(*best.shape[:-1], action.shape[-1])
-        return tensordict.set("action", action.gather(-2, best).squeeze(-2))
+        return tensordict.set(self.out_keys[0], action.gather(-2, best).squeeze(-2))
 
 
 class PLASPolicy(TensorDictModuleBase):
@@ -179,7 +176,7 @@ class PLASPolicy(TensorDictModuleBase):
         self.register_buffer("action_low", low)
         self.register_buffer("action_high", high)
         self.in_keys = list(actor_network.in_keys)
-        self.out_keys = ["action"]
+        self.out_keys = [decoder.out_keys[-1]]
 
     @classmethod
     def from_loss(cls, loss: LossModule) -> PLASPolicy:
@@ -198,14 +195,8 @@ class PLASPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes ``action``."""
-        data = self.decoder(self.actor_network(tensordict.select(*self.in_keys)))
-        action = data.get("action")
-        if self.perturbation_network is not None:
-            perturbation = self.perturbation_network(data).get("perturbation")
-            action = perturbed_action(
-                action, perturbation, self.max_perturbation, self.action_low, self.action_high
-            )
-        return tensordict.set("action", action)
+        data = _perturb(self, self.decoder(self.actor_network(tensordict.select(*self.in_keys))))
+        return tensordict.set(self.out_keys[0], data.get(self.out_keys[0]))
 
 
 class DiscreteBCQPolicy(TensorDictModuleBase):
@@ -222,6 +213,7 @@ class DiscreteBCQPolicy(TensorDictModuleBase):
     Keyword Args:
         threshold: τ. Default 0.3.
         action_space: ``"one-hot"``, written as ``(*B, n)``, or ``"categorical"``, ``(*B,)``.
+        action_key: what the action is called.
 
     Keys read: ``observation``. Key written: ``action``, int64.
 
@@ -244,6 +236,7 @@ class DiscreteBCQPolicy(TensorDictModuleBase):
         *,
         threshold: float = 0.3,
         action_space: str = "one-hot",
+        action_key: NestedKey = "action",
     ) -> None:
         super().__init__()
         self.generator = generator
@@ -251,7 +244,7 @@ class DiscreteBCQPolicy(TensorDictModuleBase):
         self.threshold = threshold
         self.action_space = action_space
         self.in_keys = list(dict.fromkeys([*generator.in_keys, *qvalue_network.in_keys]))
-        self.out_keys = ["action"]
+        self.out_keys = [action_key]
 
     @classmethod
     def from_loss(cls, loss: LossModule) -> DiscreteBCQPolicy:
@@ -261,21 +254,33 @@ class DiscreteBCQPolicy(TensorDictModuleBase):
             _instantiate(*loss.critic(0)),
             threshold=float(loss.threshold),
             action_space=loss.action_space,
+            action_key=loss.tensor_keys.action,
         )
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes ``action``."""
         data = self.qvalue_network(self.generator(tensordict.select(*self.in_keys)))
-        allowed = likely_actions(data.get("logits"), self.threshold)
-        value = data.get("action_value").masked_fill(~allowed, -torch.inf)
+        allowed = likely_actions(data.get(self.generator.out_keys[-1]), self.threshold)
+        value = data.get(self.qvalue_network.out_keys[-1]).masked_fill(~allowed, -torch.inf)
         action = value.argmax(-1)
         if self.action_space == "one-hot":
             action = one_hot(action, value.shape[-1])
-        return tensordict.set("action", action)
+        return tensordict.set(self.out_keys[0], action)
 
 
-def _network(loss: LossModule, name: str) -> TensorDictModule | None:
+def _perturb(policy: BCQPolicy | PLASPolicy, data: TensorDictBase) -> TensorDictBase:
+    """Moves the action by the policy's perturbation network, if it has one."""
+    network, key = policy.perturbation_network, policy.out_keys[0]
+    if network is None:
+        return data
+    data = network(data)
+    action, perturbation = data.get(key), data.get(network.out_keys[-1])
+    low, high = policy.action_low, policy.action_high
+    return data.set(key, perturbed_action(action, perturbation, policy.max_perturbation, low, high))
+
+
+def _network(loss: LossModule, name: str) -> Any:
     """A stand-alone copy of one of a loss's networks; ``None`` for one that it does not have."""
     module = getattr(loss, name)
     return None if module is None else _instantiate(module, getattr(loss, f"{name}_params"))

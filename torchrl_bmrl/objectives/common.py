@@ -101,7 +101,6 @@ class OfflineLoss(LossModule):
             raise UnknownNameError("reduction", reduction, REDUCTIONS)
         self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[str] | None = None
-        self._vmap_qvalue_network: Any = None
         self.gamma = gamma
         self.loss_function = loss_function
         self.separate_losses = separate_losses
@@ -169,9 +168,8 @@ class OfflineLoss(LossModule):
             )
 
     def finish(self) -> None:
-        """Ends a subclass's ``__init__``: value estimator and vmap."""
+        """Ends a subclass's ``__init__``: the value estimator, and who shares parameters."""
         self.make_value_estimator(self.default_value_estimator)
-        self._make_vmap()
         generator = self._modules.get("generator_params")
         own = set() if generator is None else {id(p) for p in generator.parameters()}
         self._shared_with_generator = {
@@ -185,21 +183,7 @@ class OfflineLoss(LossModule):
         }
 
     def _make_vmap(self) -> None:
-        if getattr(self, "_stacked", False):
-            self._vmap_qvalue_network = _vmap_func(
-                self.qvalue_network,
-                (None, 0),
-                randomness=self.vmap_randomness,
-                pseudo_vmap=self.deactivate_vmap,
-            )
-
-    def __getstate__(self) -> dict[str, Any]:
-        # A function made by vmap cannot be pickled, and a copy must not run the original's network.
-        return self.__dict__ | {"_vmap_qvalue_network": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
-        self._make_vmap()
+        """Nothing is cached that ``set_vmap_randomness`` would have to renew."""
 
     def critic(self, index: int = 0) -> tuple[TensorDictModule, TensorDictBase]:
         """One critic: its module and the parameters that belong into it."""
@@ -230,7 +214,15 @@ class OfflineLoss(LossModule):
         """Outputs of all critics with the given parameters, stacked in front."""
         inputs = tensordict.select(*self.qvalue_network.in_keys)
         if self._stacked:
-            return self._vmap_qvalue_network(inputs, params)
+            # Made anew at every call: kept, it could not be pickled, and a copy of the loss would
+            # run the original's network.
+            run = _vmap_func(
+                self.qvalue_network,
+                (None, 0),
+                randomness=self.vmap_randomness,
+                pseudo_vmap=self.deactivate_vmap,
+            )
+            return run(inputs, params)
         return self.call("qvalue_network", inputs, params)
 
     def qvalue(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:

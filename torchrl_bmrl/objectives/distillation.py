@@ -12,17 +12,19 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn import functional as F
 from torchrl.objectives.common import LossModule
-from torchrl.objectives.utils import _vmap_func
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.functional import (
     direction_error,
     sample_action_latent,
     squared_error,
+    triplet_error,
 )
+from torchrl_bmrl.objectives.common import REDUCTIONS, entry
+from torchrl_bmrl.objectives.ensemble import FrozenEnsemble
 
-REDUCTIONS = ("mean", "sum", "none")
 CONTEXTS = ("current", "previous", "random", "set")
+ENCODER_TERMS = ("classification", "generator", "direction", "qvalue", "metric")
 
 
 class MetaDistillationLoss(LossModule):
@@ -37,14 +39,19 @@ class MetaDistillationLoss(LossModule):
           + w_d \left(1 - \frac{\hat g \cdot g}{\lVert\hat g\rVert \lVert g\rVert}\right)
           + w_q \left(\hat Q(s, \hat g, m) - \tilde Q_i(s, g)\right)^2
           + w_m \lVert m \rVert_2^2
+          + w_t \max(0, \lVert m - m^+ \rVert - \lVert m - m^- \rVert + \alpha)
 
     Deviations from the paper, each of which a weight or an argument turns off: the penalty on m
     (cross-entropy alone lets m grow without bound), :math:`\tilde Q_i = (Q_i - \mu_i)/\sigma_i`
     (the teachers' values differ in scale), and ``context`` (an acting policy does not have the
-    present transition). :math:`\hat Q` is trained at :math:`\hat g` without a gradient into the
-    student's generator.
+    present transition). Off by default is the triplet loss of *Multi-task Batch Reinforcement
+    Learning with Metric Learning* (https://arxiv.org/abs/1909.11373), where :math:`m^+` embeds
+    another transition of the task and :math:`m^-` one of another task. :math:`\hat Q` is trained
+    at :math:`\hat g` without a gradient into the student's generator.
 
-    The teachers are frozen and run as one batched ensemble: row i of the data is task i.
+    The teachers are frozen: row i of the data is task i. Any decoder and critic will do, those of
+    :class:`~torchrl_bmrl.objectives.BCQLoss` and :class:`~torchrl_bmrl.objectives.PLASLoss` alike;
+    equally shaped ones run as one batched ensemble.
 
     Args:
         task_encoder: M, (observation, action, next reward, next observation) → ``task_latent``.
@@ -64,25 +71,30 @@ class MetaDistillationLoss(LossModule):
         direction_weight: w_d.
         qvalue_weight: w_q.
         latent_norm_weight: w_m.
+        metric_weight: w_t. Default 0, which leaves the term out.
+        metric_margin: α, in units of m.
+        encoder_terms: terms whose gradient reaches M, of ``"classification"``, ``"generator"``,
+            ``"direction"``, ``"qvalue"`` and ``"metric"``; by default all. The penalty on m always
+            does. ``("classification",)`` is the paper's reading.
         context: which transition m is computed from: ``"current"`` (the paper's), ``"previous"``
             (the one before it in the episode, under the key ``"previous"``), ``"random"`` (another
             one of the task in the batch) or ``"set"`` (the mean over ``context_size`` such).
         context_fraction: share of each batch whose m comes from ``context``; the rest is
             ``"current"``.
         context_size: transitions in a set.
-        detach_task_latent: cross-entropy (and the penalty on m) alone train M.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
         deactivate_vmap: run the teachers in a loop.
         use_prioritized_weights: as in TorchRL's losses.
 
     Keys read, batch ``[num_tasks, B]``: ``observation``, ``action``, ``("next", "reward")``,
     ``("next", "observation")``, ``task`` (class index, int64), and with ``context="previous"`` the
-    same transition keys under ``"previous"``. Nothing is written to the input.
+    same transition keys under ``"previous"``. Key written to the input: ``td_error
+    (num_tasks, B)``, the priority: the sum of a row's terms.
 
     Raises:
-        BMRLError: for numbers of teachers that differ, an unknown context or a share or size of it
-            out of range, data whose first dimension is not the number of teachers, or data without
-            ``"previous"`` where the context needs it.
+        BMRLError: for numbers of teachers that differ, an unknown context or term, a share or size
+            out of range; and at a call for data whose first dimension is not the number of
+            teachers, with missing keys or, on CPU and not compiled, numbers that are not finite.
 
     Example:
         >>> from torchrl_bmrl.modules import (
@@ -126,6 +138,7 @@ class MetaDistillationLoss(LossModule):
             task: class index y.
             state_action_value: the critics' output.
             previous: where the previous transition lies.
+            priority: written to the input.
             priority_weight: read from the input where present.
         """
 
@@ -136,21 +149,11 @@ class MetaDistillationLoss(LossModule):
         task: NestedKey = "task"
         state_action_value: NestedKey = "state_action_value"
         previous: NestedKey = "previous"
-        priority: NestedKey = "priority"
+        priority: NestedKey = "td_error"
         priority_weight: NestedKey = "priority_weight"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    out_keys = [  # noqa: RUF012 (TorchRL's convention)
-        "loss_classification",
-        "loss_generator",
-        "loss_direction",
-        "loss_qvalue",
-        "loss_latent_norm",
-        "accuracy",
-        "latent_norm",
-    ]
-
     task_encoder: TensorDictModule
     task_encoder_params: TensorDictParams
     target_task_encoder_params: TensorDictParams
@@ -182,10 +185,12 @@ class MetaDistillationLoss(LossModule):
         direction_weight: float = 1.0,
         qvalue_weight: float = 1.0,
         latent_norm_weight: float = 2e-3,
+        metric_weight: float = 0.0,
+        metric_margin: float = 1.0,
+        encoder_terms: Sequence[str] = ENCODER_TERMS,
         context: str = "set",
         context_fraction: float = 0.5,
         context_size: int = 8,
-        detach_task_latent: bool = False,
         reduction: str = "mean",
         deactivate_vmap: bool = False,
         use_prioritized_weights: str | bool = "auto",
@@ -204,13 +209,20 @@ class MetaDistillationLoss(LossModule):
             raise BMRLError(f"context_fraction is {context_fraction}; valid: between 0 and 1")
         if context_size < 1:
             raise BMRLError(f"context_size is {context_size}; valid: at least 1")
+        for term in encoder_terms:
+            if term not in ENCODER_TERMS:
+                raise UnknownNameError("encoder term", term, ENCODER_TERMS)
+        if metric_weight and len(teacher_generators) < 2:
+            raise BMRLError("metric_weight needs at least two tasks, one to be away from")
         self._in_keys: list[NestedKey] | None = None
+        self._out_keys: list[str] | None = None
         self.num_tasks = len(teacher_generators)
         self.latent_dim = latent_dim
         self.context = context
         self.context_fraction = context_fraction
         self.context_size = context_size
-        self.detach_task_latent = detach_task_latent
+        self.encoder_terms = tuple(encoder_terms)
+        self.metric_margin = metric_margin
         self.reduction = reduction
         self.deactivate_vmap = deactivate_vmap
         self.use_prioritized_weights = use_prioritized_weights
@@ -222,13 +234,8 @@ class MetaDistillationLoss(LossModule):
             ("student_qvalue_network", student_qvalue_network),
         ):
             self.convert_to_functional(module, name, create_target_params=False)
-        # Teachers enter as buffers: no optimizer finds them, no gradient reaches them. Outside
-        # _modules so that their first members, kept for their structure, are not state of the loss.
-        self.teacher_generator_params = _frozen_stack(teacher_generators)
-        self.teacher_qvalue_network_params = _frozen_stack(teacher_qvalue_networks)
-        self.__dict__["_teacher_generator"] = teacher_generators[0]
-        self.__dict__["_teacher_qvalue_network"] = teacher_qvalue_networks[0]
-
+        self.teacher_generators = FrozenEnsemble(teacher_generators)
+        self.teacher_qvalue_networks = FrozenEnsemble(teacher_qvalue_networks)
         reference = next(student_generator.parameters())
         zeros = torch.zeros(self.num_tasks, device=reference.device, dtype=reference.dtype)
         self.register_buffer("qvalue_loc", zeros if qvalue_loc is None else qvalue_loc.to(zeros))
@@ -242,20 +249,12 @@ class MetaDistillationLoss(LossModule):
             ("direction_weight", direction_weight),
             ("qvalue_weight", qvalue_weight),
             ("latent_norm_weight", latent_norm_weight),
+            ("metric_weight", metric_weight or None),
         ):
             self.register_coeff_buffer(name, value, device=reference.device, dtype=reference.dtype)
-        self._make_vmap()
 
     def _make_vmap(self) -> None:
-        self._vmap_teacher_generator, self._vmap_teacher_qvalue_network = (
-            _vmap_func(
-                module,
-                (0, 0),
-                randomness=self.vmap_randomness,
-                pseudo_vmap=self.deactivate_vmap,
-            )
-            for module in (self._teacher_generator, self._teacher_qvalue_network)
-        )
+        """Nothing is cached that ``set_vmap_randomness`` would have to renew."""
 
     def _forward_value_estimator_keys(self, **kwargs: object) -> None:
         self._in_keys = None
@@ -277,17 +276,39 @@ class MetaDistillationLoss(LossModule):
         self._in_keys = values
 
     @property
+    def out_keys(self) -> list[str]:
+        """Keys of the output, in the order of keyword dispatch."""
+        if self._out_keys is None:
+            self._out_keys = [
+                "loss_classification",
+                "loss_generator",
+                "loss_direction",
+                "loss_qvalue",
+                "loss_latent_norm",
+                *(["loss_metric"] if self.metric_weight is not None else []),
+                "accuracy",
+                "latent_norm",
+            ]
+        return self._out_keys
+
+    @out_keys.setter
+    def out_keys(self, values: list[str]) -> None:
+        self._out_keys = values
+
+    @property
     def _teacher_observation_keys(self) -> list[NestedKey]:
-        latent = self.tensor_keys.action_latent
-        return [key for key in self._teacher_generator.in_keys if key != latent]
+        made = (self.tensor_keys.action_latent, self.tensor_keys.action)
+        keys = [*self.teacher_generators.in_keys, *self.teacher_qvalue_networks.in_keys]
+        return [key for key in dict.fromkeys(keys) if key not in made]
 
     # -- the parts of the objective --------------------------------------------------------------
 
     def embed(self, tensordict: TensorDictBase) -> Tensor:
         """Embedding m of each row's context, ``(num_tasks, B, m)``."""
         keys = self.task_encoder.in_keys
-        current = tensordict.select(*keys)
-        latent = self._encode(current)
+        for key in keys:
+            entry(tensordict, key)
+        latent = self._encode(tensordict.select(*keys))
         if self.context == "current":
             return latent
         if self.context == "previous":
@@ -321,6 +342,8 @@ class MetaDistillationLoss(LossModule):
             ``state_action_value (num_tasks, B, 1)``.
         """
         keys = self.tensor_keys
+        for key in self._teacher_observation_keys:
+            entry(tensordict, key)
         data = tensordict.select(*self._teacher_observation_keys)
         latent = sample_action_latent(
             (*data.batch_size, self.latent_dim),
@@ -329,28 +352,51 @@ class MetaDistillationLoss(LossModule):
             dtype=self.qvalue_loc.dtype,
         )
         data = data.copy().set(keys.action_latent, latent)
-        data = self._vmap_teacher_generator(data, self.teacher_generator_params)
-        data = self._vmap_teacher_qvalue_network(data, self.teacher_qvalue_network_params)
+        for teachers in (self.teacher_generators, self.teacher_qvalue_networks):
+            data = teachers(data, randomness=self.vmap_randomness, loop=self.deactivate_vmap)
         value = data.get(keys.state_action_value)
         value = (value - self.qvalue_loc[:, None, None]) / self.qvalue_scale[:, None, None]
         return data.set(keys.state_action_value, value)
 
-    def imitate(self, taught: TensorDictBase, task_latent: Tensor) -> TensorDictBase:
-        """Student's action and value for the teachers' observations and latents."""
-        keys = self.tensor_keys
-        data = taught.select(*self._teacher_observation_keys, keys.action_latent).copy()
-        data.set(keys.task_latent, task_latent)
+    def imitate(self, taught: TensorDictBase, task_latent: Tensor) -> Tensor:
+        """Student's action for the teachers' observations and latents."""
+        data = taught.select(*self._teacher_observation_keys, self.tensor_keys.action_latent)
+        data = data.copy().set(self.tensor_keys.task_latent, task_latent)
         with self.student_generator_params.to_module(
             self.student_generator, preserve_module_state=False
         ):
-            data = self.student_generator(data)
-        judged = data.select(*self.student_qvalue_network.in_keys).copy()
-        judged.set(keys.action, judged.get(keys.action).detach())
+            return self.student_generator(data).get(self.tensor_keys.action)
+
+    def judge(self, taught: TensorDictBase, action: Tensor, task_latent: Tensor) -> Tensor:
+        """Student's value of its own action, without a gradient into the action."""
+        keys = self.tensor_keys
+        data = taught.select(*self._teacher_observation_keys).copy()
+        data.set(keys.action, action.detach()).set(keys.task_latent, task_latent)
         with self.student_qvalue_network_params.to_module(
             self.student_qvalue_network, preserve_module_state=False
         ):
-            judged = self.student_qvalue_network(judged)
-        return data.set(keys.state_action_value, judged.get(keys.state_action_value))
+            return self.student_qvalue_network(data).get(keys.state_action_value)
+
+    def classify(self, task_latent: Tensor) -> Tensor:
+        """Logits of the task, ``(num_tasks, B, num_tasks)``."""
+        keys = self.tensor_keys
+        data = TensorDict({keys.task_latent: task_latent}, task_latent.shape[:-1])
+        with self.task_classifier_params.to_module(
+            self.task_classifier, preserve_module_state=False
+        ):
+            return self.task_classifier(data).get(keys.task_logits)
+
+    def separate(self, task_latent: Tensor) -> Tensor:
+        """Triplet error of each row's m against another row of its task and one of another."""
+        num_tasks, rows = task_latent.shape[:2]
+        device = task_latent.device
+        # A cyclic shift by 1 to n - 1 is never the row, or the task, itself.
+        shift = torch.randint(1, max(rows, 2), (rows,), device=device)
+        near = task_latent[:, (torch.arange(rows, device=device) + shift) % rows]
+        shift = torch.randint(1, num_tasks, (num_tasks, rows), device=device)
+        task = (torch.arange(num_tasks, device=device).unsqueeze(-1) + shift) % num_tasks
+        row = torch.randint(rows, (num_tasks, rows), device=device)
+        return triplet_error(task_latent, near, task_latent[task, row], self.metric_margin)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -360,45 +406,38 @@ class MetaDistillationLoss(LossModule):
                 f"the data's batch size is {list(tensordict.batch_size)}; valid: "
                 f"[{self.num_tasks}, B], one row per teacher"
             )
-        keys = self.tensor_keys
-        task = tensordict.get(keys.task)
-        task_latent = self.embed(tensordict)
-        with self.task_classifier_params.to_module(
-            self.task_classifier, preserve_module_state=False
-        ):
-            classified = self.task_classifier(
-                TensorDict({keys.task_latent: task_latent}, tensordict.batch_size)
-            )
-        logits = classified.get(keys.task_logits)
+        task = entry(tensordict, self.tensor_keys.task)
+        m = self.embed(tensordict)
+        reaching = {term: m if term in self.encoder_terms else m.detach() for term in ENCODER_TERMS}
+        logits = self.classify(reaching["classification"])
+        cross_entropy = F.cross_entropy(logits.flatten(0, 1), task.flatten(), reduction="none")
         taught = self.teach(tensordict)
-        student = self.imitate(
-            taught, task_latent.detach() if self.detach_task_latent else task_latent
+        target = taught.get(self.tensor_keys.action)
+        action = {"generator": self.imitate(taught, reaching["generator"])}
+        action["direction"] = (
+            action["generator"]
+            if reaching["direction"] is reaching["generator"]
+            else self.imitate(taught, reaching["direction"])
         )
-        action, target = student.get(keys.action), taught.get(keys.action)
-        value = student.get(keys.state_action_value) - taught.get(keys.state_action_value)
-        norm = task_latent.square().sum(-1)
-        cross_entropy = F.cross_entropy(
-            logits.flatten(0, 1), task.flatten(), reduction="none"
-        ).view_as(task)
-        weights = self._maybe_get_priority_weight(tensordict)
+        value = self.judge(taught, action["generator"], reaching["qvalue"])
+        error = (value - taught.get(self.tensor_keys.state_action_value)).squeeze(-1)
+        norm = m.square().sum(-1)
         terms = {
-            "loss_classification": self.classification_weight * cross_entropy,
-            "loss_generator": self.generator_weight * squared_error(action, target),
-            "loss_direction": self.direction_weight * direction_error(action, target),
-            "loss_qvalue": self.qvalue_weight * value.squeeze(-1).square(),
+            "loss_classification": self.classification_weight * cross_entropy.view_as(task),
+            "loss_generator": self.generator_weight * squared_error(action["generator"], target),
+            "loss_direction": self.direction_weight * direction_error(action["direction"], target),
+            "loss_qvalue": self.qvalue_weight * error.square(),
             "loss_latent_norm": self.latent_norm_weight * norm,
         }
+        if self.metric_weight is not None:
+            terms["loss_metric"] = self.metric_weight * self.separate(reaching["metric"])
+        tensordict.set(self.tensor_keys.priority, sum(terms.values()).detach())
+        weights = self._maybe_get_priority_weight(tensordict)
         losses = {
             name: self._reduce_loss(term, tensordict=tensordict, weights=weights)
             for name, term in terms.items()
         }
         losses["accuracy"] = (logits.argmax(-1) == task).to(logits.dtype).mean()
         losses["latent_norm"] = norm.detach().mean().sqrt()
-        self._clear_weakrefs(tensordict, taught, student, "student_generator_params")
+        self._clear_weakrefs(tensordict, taught, "student_generator_params")
         return TensorDict(losses)
-
-
-def _frozen_stack(modules: Sequence[TensorDictModule]) -> TensorDictParams:
-    """Parameters of equally shaped modules stacked along a new first dimension, as buffers."""
-    stacked = TensorDict.from_modules(*modules, as_module=False).data.clone()
-    return TensorDictParams(stacked, no_convert=True)
