@@ -6,26 +6,26 @@ import re
 from pathlib import Path
 
 import pytest
+from helpers import NO_UPDATER
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-BLOCKS = [
-    pytest.param(block, id=f"{page.stem}-{number}")
-    for page in PAGES
-    for number, block in enumerate(re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL))
-]
+BLOCKS = {page: re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL) for page in PAGES}
 
 
-@pytest.mark.parametrize("block", BLOCKS)
-def test_example_runs(block):
-    exec(compile(block, "example", "exec"), {"__name__": "example"})
+@pytest.mark.filterwarnings(NO_UPDATER)
+@pytest.mark.parametrize("page", [p for p in PAGES if BLOCKS[p]], ids=lambda p: p.stem)
+def test_examples_of_a_page_run_one_after_the_other(page: Path) -> None:
+    namespace = {"__name__": "example"}
+    for block in BLOCKS[page]:
+        exec(compile(block, page.name, "exec"), namespace)
 
 
-def test_readme_shows_a_loss_in_use():
-    assert any("BCQLoss(" in block.values[0] for block in BLOCKS)
+def test_readme_shows_a_loss_in_use() -> None:
+    assert any("BCQLoss(" in block for block in BLOCKS[ROOT / "README.md"])
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_links_to_files_lead_somewhere(page):
+def test_links_to_files_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text()):
         assert (page.parent / target).exists(), target

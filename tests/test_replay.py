@@ -156,3 +156,13 @@ def test_the_same_seed_draws_the_same_samples(multi_task: bool) -> None:
 def test_data_of_a_buffer_lie_where_they_are_told_to(tmp_path: Any) -> None:
     make_replay_buffer(numbered(0, 50), batch_size=8, scratch_dir=str(tmp_path / "map"))
     assert any(path.is_file() for path in (tmp_path / "map").rglob("*"))
+
+
+@pytest.mark.parametrize("key", ["x", ("next", "reward")])
+def test_numbers_that_are_not_finite_do_not_get_into_a_buffer(key: Any) -> None:
+    data = stack_episodes(episodes(), task=0)
+    data[key][5] = float("nan")
+    with pytest.raises(BMRLError, match=r"is not finite in transition 5; valid: finite"):
+        make_replay_buffer(data, batch_size=2)
+    with pytest.raises(BMRLError, match="is not finite in transition 5"):
+        make_multi_task_replay_buffer([data], batch_size=2)

@@ -118,11 +118,19 @@ def make_replay_buffer(
         batch_size: transitions a sample.
         scratch_dir: where the memory map lies; a temporary folder by default.
 
+    Raises:
+        BMRLError: for numbers that are not finite. Losses look for them on CPU only: elsewhere
+            that would wait for the device.
+
     Example:
         >>> buffer = make_replay_buffer(TensorDict({"x": torch.arange(10)}, [10]), batch_size=4)
         >>> buffer.sample().batch_size
         torch.Size([4])
     """
+    for key, value in data.items(include_nested=True, leaves_only=True):
+        if value.is_floating_point() and not value.isfinite().all():
+            row = int((~value.isfinite()).nonzero()[0, 0])
+            raise BMRLError(f"{key!r} is not finite in transition {row}; valid: finite numbers")
     buffer = TensorDictReplayBuffer(
         storage=LazyMemmapStorage(len(data), scratch_dir=scratch_dir), batch_size=batch_size
     )

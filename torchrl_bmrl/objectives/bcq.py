@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.data.tensor_specs import TensorSpec
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.functional import bcq_next_value, sample_action_latent
+from torchrl_bmrl.functional import bcq_next_value
 from torchrl_bmrl.objectives.common import check_lmbda, check_value_bounds
 from torchrl_bmrl.objectives.generative import GenerativeLoss
 
@@ -163,16 +163,6 @@ class BCQLoss(GenerativeLoss):
 
     # -- losses, in update order; generator_loss is the base's -----------------------------------
 
-    def propose(self, observation: TensorDictBase) -> TensorDictBase:
-        """Adds to each row an action decoded from a random latent."""
-        latent = sample_action_latent(
-            (*observation.batch_size, self.generator.latent_dim),
-            latent_clip=self.latent_clip,
-            device=self.action_low.device,
-            dtype=self.action_low.dtype,
-        )
-        return self.decode(observation, latent)
-
     def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Critics' loss, summed over the critics; gradients reach the critics alone.
 
@@ -183,7 +173,7 @@ class BCQLoss(GenerativeLoss):
         with torch.no_grad():
             after = self.rows(tensordict, self.observation_keys, after=True)
             after = after.unsqueeze(-1).expand(*after.batch_size, self.num_candidates)
-            proposals = self.perturb(self.propose(after), target=True)
+            proposals = self.perturb(self.propose(after, self.latent_clip), target=True)
             candidates = self.qvalue(proposals, self.target_qvalue_network_params)
             next_value = bcq_next_value(candidates, self.lmbda)
             if self.value_bounds is not None:
@@ -209,7 +199,8 @@ class BCQLoss(GenerativeLoss):
         if self.perturbation_network is None:
             raise BMRLError("this BCQLoss was made without a perturbation_network")
         with torch.no_grad():
-            proposal = self.propose(self.rows(tensordict, self.observation_keys))
+            observation = self.rows(tensordict, self.observation_keys)
+            proposal = self.propose(observation, self.latent_clip)
         proposal = self.perturb(proposal)
         value = self.qvalue(proposal, self.qvalue_network_params.detach())[0]
         loss = self.reduce(-value, tensordict)

@@ -14,7 +14,12 @@ from torch import Tensor
 from torchrl.data.tensor_specs import Bounded, Composite, TensorSpec
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.functional import gaussian_kl, perturbed_action, squared_error
+from torchrl_bmrl.functional import (
+    gaussian_kl,
+    perturbed_action,
+    sample_action_latent,
+    squared_error,
+)
 from torchrl_bmrl.objectives.common import OfflineLoss, check_same_shape, next_key
 
 KL_REDUCTIONS = ("mean", "sum")
@@ -24,7 +29,7 @@ class GenerativeLoss(OfflineLoss):
     r"""Base of losses around a conditional variational autoencoder of the data's actions.
 
     It brings the autoencoder's own loss, :meth:`generator_loss`, and the way from a latent to an
-    action, :meth:`decode` and :meth:`perturb`. The generator has no target.
+    action, :meth:`propose`, :meth:`decode` and :meth:`perturb`. The generator has no target.
 
     Args:
         generator: a module with two :class:`~tensordict.nn.TensorDictModule` children: ``encoder``
@@ -77,13 +82,13 @@ class GenerativeLoss(OfflineLoss):
     def __init__(
         self,
         generator: TensorDictModule,
-        perturbation_network: TensorDictModule | None,
+        perturbation_network: TensorDictModule | None = None,
         *,
-        action_spec: TensorSpec | None,
-        bounds: tuple[float | Tensor, float | Tensor] | None,
-        kl_weight: float,
-        kl_reduction: str,
-        max_perturbation: float,
+        action_spec: TensorSpec | None = None,
+        bounds: tuple[float | Tensor, float | Tensor] | None = None,
+        kl_weight: float = 0.5,
+        kl_reduction: str = "mean",
+        max_perturbation: float = 0.05,
         **options: Any,
     ) -> None:
         super().__init__(**options)
@@ -135,6 +140,18 @@ class GenerativeLoss(OfflineLoss):
         params = self.generator_params.detach()
         with params.to_module(self.generator, preserve_module_state=False):
             return self.generator.decoder(data)
+
+    def propose(
+        self, observation: TensorDictBase, latent_clip: float | Tensor | None
+    ) -> TensorDictBase:
+        """The observation with an action decoded from z ~ N(0, I) within ±``latent_clip``."""
+        latent = sample_action_latent(
+            (*observation.batch_size, self.generator.latent_dim),
+            latent_clip=latent_clip,
+            device=self.action_low.device,
+            dtype=self.action_low.dtype,
+        )
+        return self.decode(observation, latent)
 
     def perturb(self, tensordict: TensorDictBase, *, target: bool = False) -> TensorDictBase:
         """Moves the action by the perturbation network or its ``target``, if there is one."""
