@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams
@@ -69,6 +69,7 @@ class GenerativeLoss(OfflineLoss):
         perturbation: NestedKey = "perturbation"
 
     default_keys = _AcceptedKeys
+    state_networks: ClassVar[tuple[str, ...]] = ("qvalue_network", "perturbation_network")
 
     generator: TensorDictModule
     generator_params: TensorDictParams
@@ -117,12 +118,12 @@ class GenerativeLoss(OfflineLoss):
 
     @property
     def observation_keys(self) -> list[NestedKey]:
-        """What decoder, critics and perturbation network read of a state."""
-        keys = [*self.generator.decoder.in_keys, *self.qvalue_network.in_keys]
-        if self.perturbation_network is not None:
-            keys += self.perturbation_network.in_keys
+        """What decoder and ``state_networks`` read of a state."""
+        networks = [getattr(self, name) for name in self.state_networks]
+        keys = [key for network in networks if network is not None for key in network.in_keys]
         made = (self.tensor_keys.action_latent, self.tensor_keys.action)
-        return [key for key in dict.fromkeys(keys) if key not in made]
+        keys = dict.fromkeys([*self.generator.decoder.in_keys, *keys])
+        return [key for key in keys if key not in made]
 
     def read_keys(self) -> Iterable[NestedKey]:
         """Observation and action, and the next observation."""

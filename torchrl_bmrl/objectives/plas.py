@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, dispatch
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data.tensor_specs import TensorSpec
 
@@ -95,6 +94,8 @@ class PLASLoss(GenerativeLoss):
         >>> (losses["loss_qvalue"] + losses["loss_actor"]).backward()
     """
 
+    state_networks = ("actor_network", "qvalue_network", "perturbation_network")
+
     actor_network: TensorDictModule
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
@@ -139,11 +140,6 @@ class PLASLoss(GenerativeLoss):
         self.convert_to_functional(actor_network, "actor_network", create_target_params=True)
         self.convert_critics(qvalue_network, num_qvalue_nets)
         self.finish()
-
-    @property
-    def observation_keys(self) -> list[NestedKey]:
-        """What the networks read of a state."""
-        return list(dict.fromkeys([*self.actor_network.in_keys, *super().observation_keys]))
 
     def written_keys(self) -> list[str]:
         """Losses in update order, then metrics."""
