@@ -10,7 +10,7 @@ from torchrl.data.tensor_specs import TensorSpec
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.functional import bcq_next_value
-from torchrl_bmrl.objectives.common import check_lmbda, check_value_bounds
+from torchrl_bmrl.objectives.checks import check_lmbda, check_value_bounds
 from torchrl_bmrl.objectives.generative import GenerativeLoss
 
 

@@ -16,12 +16,14 @@ from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import (
     ValueEstimators,
     _vmap_func,
+    default_value_kwargs,
     dispatch_value_estimator,
     distance_loss,
 )
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
+from torchrl_bmrl.objectives.checks import entry, missing, next_key
 
 LOSS_FUNCTIONS = ("l2", "l1", "smooth_l1")
 REDUCTIONS = ("mean", "sum", "none")
@@ -146,7 +148,8 @@ class OfflineLoss(LossModule):
             count = default if num_qvalue_nets is None else num_qvalue_nets
             if count < 1:
                 raise BMRLError(f"num_qvalue_nets is {count}; valid: at least 1")
-            critics = [qvalue_network, *(_renewed(qvalue_network) for _ in range(count - 1))]
+            taken = list(self.parameters())
+            critics = [qvalue_network, *(_renewed(qvalue_network, taken) for _ in range(count - 1))]
         self.num_qvalue_nets = len(critics)
         owners = [id(p) for critic in critics for p in critic.parameters()]
         known = {id(p) for p in self.parameters()}
@@ -317,7 +320,8 @@ class OfflineLoss(LossModule):
         )
         # TorchRL keeps hyper-parameters in float32; 0.99 is another number there.
         estimator.to(next(self.parameters()))
-        for name, value in ({"gamma": self.gamma} | hyperparams).items():
+        exact = default_value_kwargs(self.value_type) | {"gamma": self.gamma} | hyperparams
+        for name, value in exact.items():
             if name in dict(estimator.named_buffers()):
                 estimator.get_buffer(name).fill_(value)
         return self
@@ -400,88 +404,6 @@ class OfflineLoss(LossModule):
         return result
 
 
-def check_lmbda(lmbda: float) -> float:
-    """λ of the soft clipped double-Q.
-
-    Raises:
-        BMRLError: outside [0, 1].
-    """
-    if not 0.0 <= lmbda <= 1.0:
-        raise BMRLError(f"lmbda is {lmbda}; valid: between 0 and 1")
-    return lmbda
-
-
-def check_value_bounds(bounds: tuple[float, float] | None) -> tuple[float, float] | None:
-    """Bounds on a value, in order.
-
-    Raises:
-        BMRLError: if the lower one is not below the upper one.
-    """
-    if bounds is not None and not bounds[0] < bounds[1]:
-        raise BMRLError(f"value_bounds are {bounds}; valid: (low, high) with low < high, or None")
-    return bounds
-
-
-def check_same_shape(key: NestedKey, value: Tensor, expected: Tensor) -> None:
-    """Refuses what would be broadcast in silence.
-
-    Raises:
-        BMRLError: naming the key and both shapes.
-    """
-    if value.shape != expected.shape:
-        raise BMRLError(
-            f"{key!r} has the shape {tuple(value.shape)}; valid: {tuple(expected.shape)}, as the "
-            "networks have it"
-        )
-
-
-def next_key(key: NestedKey) -> tuple[str, ...]:
-    """The key under ``"next"``.
-
-    Example:
-        >>> next_key("reward"), next_key(("agent", "reward"))
-        (('next', 'reward'), ('next', 'agent', 'reward'))
-    """
-    return ("next", key) if isinstance(key, str) else ("next", *key)
-
-
-def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """One entry of the data, finite.
-
-    On CPU a number that is not finite is refused; elsewhere that would wait for the device, and
-    in a compiled loss it cannot be said.
-
-    Raises:
-        BMRLError: if it is missing, or holds NaN or infinity.
-
-    Example:
-        >>> entry(TensorDict({"reward": torch.tensor([1.0])}, []), "reward")
-        tensor([1.])
-    """
-    value = tensordict.get(key, None)
-    if value is None:
-        raise missing(tensordict, key)
-    if (
-        not torch.compiler.is_compiling()
-        and value.device.type == "cpu"
-        and value.is_floating_point()
-    ):
-        finite = value.isfinite()
-        if not finite.all():
-            first = tuple((~finite).nonzero()[0].tolist())
-            raise BMRLError(
-                f"{key!r} holds {int((~finite).sum())} numbers that are not finite, the first, "
-                f"{value[first].item()}, at {first}; valid: finite numbers"
-            )
-    return value
-
-
-def missing(tensordict: TensorDictBase, key: NestedKey) -> BMRLError:
-    """The error for an entry that the data lack."""
-    present = [str(key) for key in tensordict.keys(include_nested=True, leaves_only=True)]
-    return BMRLError(f"the data have no {key!r}; they have: {', '.join(present) or 'nothing'}")
-
-
 class _Ensemble(TensorDictModuleBase):
     """Critics that are run one after the other, their outputs stacked in front."""
 
@@ -495,15 +417,16 @@ class _Ensemble(TensorDictModuleBase):
         return torch.stack([critic(tensordict.copy()) for critic in self.critics])
 
 
-def _renewed(module: TensorDictModule) -> TensorDictModule:
-    """A copy with an initialisation of its own."""
-    copy = deepcopy(module)
+def _renewed(module: TensorDictModule, shared: Sequence[nn.Parameter]) -> TensorDictModule:
+    """A copy with an initialisation of its own, but for what it shares with another network."""
+    copy = deepcopy(module, {id(parameter): parameter for parameter in shared})
     for name, part in copy.named_modules():
-        if hasattr(part, "reset_parameters"):
-            part.reset_parameters()
-        elif next(part.parameters(recurse=False), None) is not None:
+        own = [p for p in part.parameters(recurse=False) if not any(p is other for other in shared)]
+        if own and not hasattr(part, "reset_parameters"):
             raise BMRLError(
                 f"the critic's part {name!r}, a {type(part).__name__}, has no reset_parameters() "
                 "to initialise a copy with; valid: a list of critics, each initialised on its own"
             )
+        if own:
+            part.reset_parameters()
     return copy

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.functional import likely_actions
-from torchrl_bmrl.objectives.common import OfflineLoss, missing, next_key
+from torchrl_bmrl.objectives.checks import missing, next_key
+from torchrl_bmrl.objectives.common import OfflineLoss
 
 ACTION_SPACES = ("one-hot", "categorical")
 

@@ -20,7 +20,8 @@ from torchrl_bmrl.functional import (
     squared_error,
     triplet_error,
 )
-from torchrl_bmrl.objectives.common import REDUCTIONS, entry
+from torchrl_bmrl.objectives.checks import entry
+from torchrl_bmrl.objectives.common import REDUCTIONS
 from torchrl_bmrl.objectives.ensemble import FrozenEnsemble
 
 CONTEXTS = ("current", "previous", "random", "set")

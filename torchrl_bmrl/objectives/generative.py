@@ -20,7 +20,8 @@ from torchrl_bmrl.functional import (
     sample_action_latent,
     squared_error,
 )
-from torchrl_bmrl.objectives.common import OfflineLoss, check_same_shape, next_key
+from torchrl_bmrl.objectives.checks import check_same_shape, next_key
+from torchrl_bmrl.objectives.common import OfflineLoss
 
 KL_REDUCTIONS = ("mean", "sum")
 
@@ -122,8 +123,8 @@ class GenerativeLoss(OfflineLoss):
         networks = [getattr(self, name) for name in self.state_networks]
         keys = [key for network in networks if network is not None for key in network.in_keys]
         made = (self.tensor_keys.action_latent, self.tensor_keys.action)
-        keys = dict.fromkeys([*self.generator.decoder.in_keys, *keys])
-        return [key for key in keys if key not in made]
+        keys = [*self.generator.decoder.in_keys, *keys]
+        return [key for key in dict.fromkeys(keys) if key not in made]
 
     def read_keys(self) -> Iterable[NestedKey]:
         """Observation and action, and the next observation."""

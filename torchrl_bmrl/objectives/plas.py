@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.data.tensor_specs import TensorSpec
 
 from torchrl_bmrl.functional import soft_clipped_value
-from torchrl_bmrl.objectives.common import check_lmbda
+from torchrl_bmrl.objectives.checks import check_lmbda
 from torchrl_bmrl.objectives.generative import GenerativeLoss
 
 

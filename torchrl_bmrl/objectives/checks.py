@@ -1,0 +1,92 @@
+"""What the losses ask of their options and of the data."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from torchrl_bmrl.errors import BMRLError
+
+
+def check_lmbda(lmbda: float) -> float:
+    """λ of the soft clipped double-Q.
+
+    Raises:
+        BMRLError: outside [0, 1].
+    """
+    if not 0.0 <= lmbda <= 1.0:
+        raise BMRLError(f"lmbda is {lmbda}; valid: between 0 and 1")
+    return lmbda
+
+
+def check_value_bounds(bounds: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Bounds on a value, in order.
+
+    Raises:
+        BMRLError: if the lower one is not below the upper one.
+    """
+    if bounds is not None and not bounds[0] < bounds[1]:
+        raise BMRLError(f"value_bounds are {bounds}; valid: (low, high) with low < high, or None")
+    return bounds
+
+
+def check_same_shape(key: NestedKey, value: Tensor, expected: Tensor) -> None:
+    """Refuses what would be broadcast in silence.
+
+    Raises:
+        BMRLError: naming the key and both shapes.
+    """
+    if value.shape != expected.shape:
+        raise BMRLError(
+            f"{key!r} has the shape {tuple(value.shape)}; valid: {tuple(expected.shape)}, as the "
+            "networks have it"
+        )
+
+
+def next_key(key: NestedKey) -> tuple[str, ...]:
+    """The key under ``"next"``.
+
+    Example:
+        >>> next_key("reward"), next_key(("agent", "reward"))
+        (('next', 'reward'), ('next', 'agent', 'reward'))
+    """
+    return ("next", key) if isinstance(key, str) else ("next", *key)
+
+
+def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """One entry of the data, finite.
+
+    On CPU a number that is not finite is refused; elsewhere that would wait for the device, and
+    in a compiled loss it cannot be said.
+
+    Raises:
+        BMRLError: if it is missing, or holds NaN or infinity.
+
+    Example:
+        >>> entry(TensorDict({"reward": torch.tensor([1.0])}, []), "reward")
+        tensor([1.])
+    """
+    value = tensordict.get(key, None)
+    if value is None:
+        raise missing(tensordict, key)
+    if (
+        not torch.compiler.is_compiling()
+        and value.device.type == "cpu"
+        and value.is_floating_point()
+    ):
+        finite = value.isfinite()
+        if not finite.all():
+            first = tuple((~finite).nonzero()[0].tolist())
+            raise BMRLError(
+                f"{key!r} holds {int((~finite).sum())} numbers that are not finite, the first, "
+                f"{value[first].item()}, at {first}; valid: finite numbers"
+            )
+    return value
+
+
+def missing(tensordict: TensorDictBase, key: NestedKey) -> BMRLError:
+    """The error for an entry that the data lack."""
+    present = [str(key) for key in tensordict.keys(include_nested=True, leaves_only=True)]
+    return BMRLError(f"the data have no {key!r}; they have: {', '.join(present) or 'nothing'}")
