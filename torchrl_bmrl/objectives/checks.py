@@ -65,6 +65,7 @@ def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         BMRLError: if it is missing, or holds NaN or infinity.
 
     Example:
+        >>> from tensordict import TensorDict
         >>> entry(TensorDict({"reward": torch.tensor([1.0])}, []), "reward")
         tensor([1.])
     """
