@@ -173,6 +173,8 @@ class OfflineLoss(LossModule):
     def finish(self) -> None:
         """Ends a subclass's ``__init__``: the value estimator, and who shares parameters."""
         self.make_value_estimator(self.default_value_estimator)
+        # Found once and kept: found at the first call, it would make a compiled loss compile again.
+        self.set_vmap_randomness(self.vmap_randomness)
         generator = self._modules.get("generator_params")
         own = set() if generator is None else {id(p) for p in generator.parameters()}
         self._shared_with_generator = {

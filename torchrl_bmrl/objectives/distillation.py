@@ -253,6 +253,8 @@ class MetaDistillationLoss(LossModule):
             ("metric_weight", metric_weight or None),
         ):
             self.register_coeff_buffer(name, value, device=reference.device, dtype=reference.dtype)
+        # Found once and kept: found at the first call, it would make a compiled loss compile again.
+        self.set_vmap_randomness(self.vmap_randomness)
 
     def _make_vmap(self) -> None:
         """Nothing is cached that ``set_vmap_randomness`` would have to renew."""
