@@ -19,7 +19,13 @@ def make_mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> M
         >>> make_mlp(3, 2, (8,))(torch.zeros(5, 1), torch.zeros(5, 2)).shape
         torch.Size([5, 2])
     """
-    return MLP(in_features, out_features, num_cells=list(num_cells), activation_class=nn.ReLU)
+    return MLP(
+        in_features,
+        out_features,
+        num_cells=list(num_cells),
+        activation_class=nn.ReLU,
+        activation_kwargs={"inplace": True},
+    )
 
 
 class _Posterior(nn.Module):

@@ -24,6 +24,7 @@ from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.objectives.checks import entry, missing, next_key
+from torchrl_bmrl.objectives.swap import holding, leaves
 
 LOSS_FUNCTIONS = ("l2", "l1", "smooth_l1")
 REDUCTIONS = ("mean", "sum", "none")
@@ -212,23 +213,28 @@ class OfflineLoss(LossModule):
         """Runs a network of this loss with its own or the given parameters."""
         module = getattr(self, name)
         params = getattr(self, f"{name}_params") if params is None else params
-        with params.to_module(module, preserve_module_state=False):
+        with holding(module, params):
             return module(tensordict)
 
     def evaluate(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
         """Outputs of all critics with the given parameters, stacked in front."""
         inputs = tensordict.select(*self.qvalue_network.in_keys)
-        if self._stacked:
-            # Made anew at every call: kept, it could not be pickled, and a copy of the loss would
-            # run the original's network.
-            run = _vmap_func(
-                self.qvalue_network,
-                (None, 0),
-                randomness=self.vmap_randomness,
-                pseudo_vmap=self.deactivate_vmap,
-            )
-            return run(inputs, params)
-        return self.call("qvalue_network", inputs, params)
+        if not self._stacked:
+            return self.call("qvalue_network", inputs, params)
+        if torch.compiler.is_compiling():
+            each = params.unbind(0)
+            on_cpu = next(iter(params.values(True, True))).device.type == "cpu"
+        else:
+            stacked = leaves(params)
+            each = list(map(list, zip(*(leaf.unbind(0) for leaf in stacked), strict=True)))
+            on_cpu = stacked[0].device.type == "cpu"
+        if self.deactivate_vmap or on_cpu:
+            # On CPU a batched matrix product is slower than one product after the other.
+            return torch.stack([self.call("qvalue_network", inputs.copy(), own) for own in each])
+        # Made anew at every call: kept, it could not be pickled, and a copy of the loss would run
+        # the original's network.
+        run = _vmap_func(self.qvalue_network, (None, 0), randomness=self.vmap_randomness)
+        return run(inputs, params)
 
     def qvalue(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
         """Q of each critic with the given parameters, ``(num_qvalue_nets, *B)``.
@@ -393,16 +399,18 @@ class OfflineLoss(LossModule):
             BMRLError: for a missing key, a number that is not finite, or another batch shape.
         """
         batch = self.batch_shape(tensordict)
-        result = TensorDict({}, batch_size=batch)
-        for key in keys:
-            full = next_key(key) if after else key
-            value = entry(tensordict, full)
-            if value.shape[: len(batch)] != batch:
-                raise BMRLError(
-                    f"{full!r} has the shape {tuple(value.shape)}; valid: {tuple(batch)} and its "
-                    "own dimensions, as the action has"
-                )
-            result.set(key, value)
+        result = (tensordict.get("next") if after else tensordict).select(*keys)
+        if not torch.compiler.is_compiling():
+            for key in keys:
+                full = next_key(key) if after else key
+                value = entry(tensordict, full)
+                if value.shape[: len(batch)] != batch:
+                    raise BMRLError(
+                        f"{full!r} has the shape {tuple(value.shape)}; valid: {tuple(batch)} and "
+                        "its own dimensions, as the action has"
+                    )
+        if result.batch_size != batch:
+            result.batch_size = batch
         return result
 
 

@@ -22,6 +22,7 @@ from torchrl_bmrl.functional import (
 )
 from torchrl_bmrl.objectives.checks import check_same_shape, next_key
 from torchrl_bmrl.objectives.common import OfflineLoss
+from torchrl_bmrl.objectives.swap import holding
 
 KL_REDUCTIONS = ("mean", "sum")
 
@@ -139,8 +140,8 @@ class GenerativeLoss(OfflineLoss):
         A gradient may reach the latent, never the generator.
         """
         data = observation.copy().set(self.tensor_keys.action_latent, latent)
-        params = self.generator_params.detach()
-        with params.to_module(self.generator, preserve_module_state=False):
+        params = self.generator_params
+        with holding(self.generator, params.detach() if torch.is_grad_enabled() else params):
             return self.generator.decoder(data)
 
     def propose(
@@ -187,7 +188,7 @@ class GenerativeLoss(OfflineLoss):
             dict.fromkeys([*self.generator.encoder.in_keys, *self.observation_keys, keys.action]),
         )
         action = data.get(keys.action)
-        with self.generator_params.to_module(self.generator, preserve_module_state=False):
+        with holding(self.generator, self.generator_params):
             data = self.generator.encoder(data)
             loc, scale = data.get(keys.action_latent_loc), data.get(keys.action_latent_scale)
             data.set(keys.action_latent, loc + scale * torch.randn_like(scale))
