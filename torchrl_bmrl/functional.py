@@ -180,6 +180,8 @@ def triplet_error(anchor: Tensor, positive: Tensor, negative: Tensor, margin: fl
     Reference: Li et al., *Multi-task Batch Reinforcement Learning with Metric Learning*, NeurIPS
     2020, https://arxiv.org/abs/1909.11373.
 
+    PyTorch's distance adds 1e-6 to every difference, for a gradient where two points meet.
+
     Args:
         anchor: m, ``(*B, n)``.
         positive: an embedding of the same task, ``(*B, n)``.

@@ -217,7 +217,7 @@ def action_bounds(
 
     Example:
         >>> action_bounds(None, (-1.0, 1.0), "action")
-        (tensor(-1.), tensor(1.))
+        (tensor(-1., dtype=torch.float64), tensor(1., dtype=torch.float64))
     """
     if (action_spec is None) == (bounds is None):
         raise BMRLError(
@@ -229,7 +229,11 @@ def action_bounds(
         if not isinstance(action_spec, Bounded):
             raise BMRLError(f"action_spec is a {type(action_spec).__name__}; valid: Bounded")
         bounds = (action_spec.space.low, action_spec.space.high)
-    low, high = (torch.as_tensor(bound) for bound in bounds)
+    # Numbers in float64: in a float64 loss 0.4 must not become 0.4 in float32.
+    low, high = (
+        bound if isinstance(bound, Tensor) else torch.tensor(bound, dtype=torch.float64)
+        for bound in bounds
+    )
     if (low > high).any():
         raise BMRLError(f"the lower bound {low} of the action is above the upper bound {high}")
     return low, high
