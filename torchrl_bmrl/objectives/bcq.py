@@ -174,12 +174,12 @@ class BCQLoss(GenerativeLoss):
             after = self.rows(tensordict, self.observation_keys, after=True)
             after = after.unsqueeze(-1).expand(*after.batch_size, self.num_candidates)
             proposals = self.perturb(self.propose(after, self.latent_clip), target=True)
-            candidates = self.qvalue(proposals, self.target_qvalue_network_params)
+            candidates = self.qvalue(proposals, target=True)
             next_value = bcq_next_value(candidates, self.lmbda)
             if self.value_bounds is not None:
                 next_value = next_value.clamp(*self.value_bounds)
         data = self.rows(tensordict, self.qvalue_network.in_keys)
-        predicted = self.qvalue(data, self.trained("qvalue_network_params"))
+        predicted = self.qvalue(data)
         result = self.temporal_difference(tensordict, predicted, next_value)
         self._clear_weakrefs(
             tensordict,
@@ -202,7 +202,7 @@ class BCQLoss(GenerativeLoss):
             observation = self.rows(tensordict, self.observation_keys)
             proposal = self.propose(observation, self.latent_clip)
         proposal = self.perturb(proposal)
-        value = self.qvalue(proposal, self.qvalue_network_params.detach())[0]
+        value = self.qvalue(proposal, frozen=True)[0]
         loss = self.reduce(-value, tensordict)
         self._clear_weakrefs(tensordict, proposal, "perturbation_network_params")
         return loss, {}

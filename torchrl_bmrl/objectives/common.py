@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -24,7 +24,7 @@ from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.objectives.checks import entry, missing, next_key
-from torchrl_bmrl.objectives.swap import holding, leaves
+from torchrl_bmrl.objectives.swap import holding, leaves, without_gradient
 
 LOSS_FUNCTIONS = ("l2", "l1", "smooth_l1")
 REDUCTIONS = ("mean", "sum", "none")
@@ -198,52 +198,88 @@ class OfflineLoss(LossModule):
         params = self.qvalue_network_params["critics", str(index)]
         return self.qvalue_network.critics[index], params
 
-    def trained(self, name: str) -> TensorDictParams | TensorDictBase:
-        """Parameters of a network as its own loss trains them, see ``separate_losses``."""
-        params = getattr(self, name)
-        shared = self._shared_with_generator[name] if self.separate_losses else []
-        if not shared:
-            return params
-        params = TensorDict(params.flatten_keys(".").to_dict()).unflatten_keys(".")
-        return params.update({key: params[key].detach() for key in shared})
+    def weights(
+        self, name: str, *, target: bool = False, frozen: bool = False
+    ) -> TensorDictBase | list[Tensor]:
+        """Parameters of a network, to be put into it by :func:`holding`.
+
+        Args:
+            name: the network, such as ``"qvalue_network"``.
+            target: those of its target.
+            frozen: without a gradient into them. Otherwise they are as the network's own loss
+                trains them, see ``separate_losses``.
+        """
+        attribute = f"target_{name}_params" if target else f"{name}_params"
+        shared = self._shared_with_generator[attribute] if self.separate_losses else []
+        if torch.compiler.is_compiling():
+            params = getattr(self, attribute)
+            if frozen:
+                return params.detach()
+            return without_gradient(params, shared) if shared else params
+        if shared and not frozen:
+            return leaves(without_gradient(getattr(self, attribute), shared))
+        # TorchRL forgets whatever is named _cache when the loss moves to another type or device.
+        cache = self.__dict__.setdefault("_cache_leaves", {})
+        if attribute not in cache:
+            cache[attribute] = leaves(getattr(self, attribute))
+        if frozen and torch.is_grad_enabled():
+            return [leaf.detach() for leaf in cache[attribute]]
+        return cache[attribute]
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy's parameters are others.
+        return {key: value for key, value in self.__dict__.items() if key != "_cache_leaves"}
 
     def call(
-        self, name: str, tensordict: TensorDictBase, params: TensorDictBase | None = None
+        self, name: str, tensordict: TensorDictBase, *, target: bool = False, frozen: bool = False
     ) -> TensorDictBase:
-        """Runs a network of this loss with its own or the given parameters."""
+        """Runs a network, its ``target``, or it ``frozen``; see :meth:`weights`."""
         module = getattr(self, name)
-        params = getattr(self, f"{name}_params") if params is None else params
-        with holding(module, params):
+        with holding(module, self.weights(name, target=target, frozen=frozen)):
             return module(tensordict)
 
-    def evaluate(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
-        """Outputs of all critics with the given parameters, stacked in front."""
-        inputs = tensordict.select(*self.qvalue_network.in_keys)
+    def evaluate(
+        self,
+        tensordict: TensorDictBase,
+        key: NestedKey,
+        *,
+        target: bool = False,
+        frozen: bool = False,
+    ) -> Tensor:
+        """One output of all critics, stacked in front."""
+        network = self.qvalue_network
+        inputs = tensordict.select(*network.in_keys)
         if not self._stacked:
-            return self.call("qvalue_network", inputs, params)
-        if torch.compiler.is_compiling():
-            each = params.unbind(0)
-            on_cpu = next(iter(params.values(True, True))).device.type == "cpu"
+            return self.call("qvalue_network", inputs, target=target, frozen=frozen).get(key)
+        weights = self.weights("qvalue_network", target=target, frozen=frozen)
+        if isinstance(weights, list):
+            each: Any = map(list, zip(*(leaf.unbind(0) for leaf in weights), strict=True))
         else:
-            stacked = leaves(params)
-            each = list(map(list, zip(*(leaf.unbind(0) for leaf in stacked), strict=True)))
-            on_cpu = stacked[0].device.type == "cpu"
-        if self.deactivate_vmap or on_cpu:
+            each = weights.unbind(0)
+        device = next(self.parameters()).device
+        if self.deactivate_vmap or device.type == "cpu":
             # On CPU a batched matrix product is slower than one product after the other.
-            return torch.stack([self.call("qvalue_network", inputs.copy(), own) for own in each])
+            outputs = []
+            for own in each:
+                with holding(network, own):
+                    outputs.append(network(inputs.copy()).get(key))
+            return torch.stack(outputs)
         # Made anew at every call: kept, it could not be pickled, and a copy of the loss would run
         # the original's network.
-        run = _vmap_func(self.qvalue_network, (None, 0), randomness=self.vmap_randomness)
-        return run(inputs, params)
+        run = _vmap_func(network, (None, 0), randomness=self.vmap_randomness)
+        params = getattr(self, f"{'target_' if target else ''}qvalue_network_params")
+        return run(inputs, params.detach() if frozen else params).get(key)
 
-    def qvalue(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
-        """Q of each critic with the given parameters, ``(num_qvalue_nets, *B)``.
+    def qvalue(
+        self, tensordict: TensorDictBase, *, target: bool = False, frozen: bool = False
+    ) -> Tensor:
+        """Q of each critic, its ``target``, or it ``frozen``, ``(num_qvalue_nets, *B)``.
 
         Raises:
             BMRLError: if the critics' output is not ``(*B, 1)``.
         """
         key = self.tensor_keys.state_action_value
-        value = self.evaluate(tensordict, params).get(key)
+        value = self.evaluate(tensordict, key, target=target, frozen=frozen)
         if value.shape[-1] != 1:
             raise BMRLError(f"the critics' {key!r} has shape {tuple(value.shape)}; valid: (*B, 1)")
         return value.squeeze(-1)

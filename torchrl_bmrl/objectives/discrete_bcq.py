@@ -200,9 +200,12 @@ class DiscreteBCQLoss(OfflineLoss):
         data = self.rows(tensordict, self.generator.in_keys, after=after)
         return self.call("generator", data).get(self.tensor_keys.logits)
 
-    def qvalue(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
+    def qvalue(
+        self, tensordict: TensorDictBase, *, target: bool = False, frozen: bool = False
+    ) -> Tensor:
         """Value of every action under each critic, ``(num_qvalue_nets, *B, n)``."""
-        return self.evaluate(tensordict, params).get(self.tensor_keys.action_value)
+        key = self.tensor_keys.action_value
+        return self.evaluate(tensordict, key, target=target, frozen=frozen)
 
     # -- losses, in update order -----------------------------------------------------------------
 
@@ -230,12 +233,12 @@ class DiscreteBCQLoss(OfflineLoss):
         with torch.no_grad():
             after = self.rows(tensordict, self.qvalue_network.in_keys, after=True)
             allowed = likely_actions(self.logits(tensordict, after=True), self.threshold)
-            value = self.qvalue(after, self.qvalue_network_params).amin(0)
+            value = self.qvalue(after).amin(0)
             best = value.masked_fill(~allowed, -torch.inf).argmax(-1, keepdim=True)
-            value = self.qvalue(after, self.target_qvalue_network_params).amin(0)
+            value = self.qvalue(after, target=True).amin(0)
             next_value = value.gather(-1, best).squeeze(-1)
         data = self.rows(tensordict, self.qvalue_network.in_keys)
-        value = self.qvalue(data, self.trained("qvalue_network_params"))
+        value = self.qvalue(data)
         index = self.action_index(tensordict, value.shape[-1]).expand(value.shape[:-1])
         predicted = value.gather(-1, index.unsqueeze(-1)).squeeze(-1)
         result = self.temporal_difference(tensordict, predicted, next_value)

@@ -140,8 +140,7 @@ class GenerativeLoss(OfflineLoss):
         A gradient may reach the latent, never the generator.
         """
         data = observation.copy().set(self.tensor_keys.action_latent, latent)
-        params = self.generator_params
-        with holding(self.generator, params.detach() if torch.is_grad_enabled() else params):
+        with holding(self.generator, self.weights("generator", frozen=True)):
             return self.generator.decoder(data)
 
     def propose(
@@ -161,12 +160,7 @@ class GenerativeLoss(OfflineLoss):
         if self.perturbation_network is None:
             return tensordict
         keys = self.tensor_keys
-        params = (
-            self.target_perturbation_network_params
-            if target
-            else self.trained("perturbation_network_params")
-        )
-        tensordict = self.call("perturbation_network", tensordict, params)
+        tensordict = self.call("perturbation_network", tensordict, target=target)
         action, perturbation = tensordict.get(keys.action), tensordict.get(keys.perturbation)
         check_same_shape(keys.perturbation, perturbation, action)
         action = perturbed_action(
@@ -188,7 +182,7 @@ class GenerativeLoss(OfflineLoss):
             dict.fromkeys([*self.generator.encoder.in_keys, *self.observation_keys, keys.action]),
         )
         action = data.get(keys.action)
-        with holding(self.generator, self.generator_params):
+        with holding(self.generator, self.weights("generator")):
             data = self.generator.encoder(data)
             loc, scale = data.get(keys.action_latent_loc), data.get(keys.action_latent_scale)
             data.set(keys.action_latent, loc + scale * torch.randn_like(scale))

@@ -158,10 +158,7 @@ class PLASLoss(GenerativeLoss):
 
     def act(self, observation: TensorDictBase, *, target: bool = False) -> TensorDictBase:
         """The observation with the policy's, or its ``target``'s, action."""
-        params = (
-            self.target_actor_network_params if target else self.trained("actor_network_params")
-        )
-        latent = self.call("actor_network", observation.copy(), params)
+        latent = self.call("actor_network", observation.copy(), target=target)
         decoded = self.decode(observation, latent.get(self.tensor_keys.action_latent))
         return self.perturb(decoded, target=target)
 
@@ -175,10 +172,10 @@ class PLASLoss(GenerativeLoss):
         with torch.no_grad():
             after = self.rows(tensordict, self.observation_keys, after=True)
             after = self.act(after, target=True)
-            value = self.qvalue(after, self.target_qvalue_network_params)
+            value = self.qvalue(after, target=True)
             next_value = soft_clipped_value(value, self.lmbda)
         data = self.rows(tensordict, self.qvalue_network.in_keys)
-        predicted = self.qvalue(data, self.trained("qvalue_network_params"))
+        predicted = self.qvalue(data)
         result = self.temporal_difference(tensordict, predicted, next_value)
         self._clear_weakrefs(
             tensordict,
@@ -193,7 +190,7 @@ class PLASLoss(GenerativeLoss):
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """-Q of the first critic at the policy's action; trains policy and perturbation alone."""
         acted = self.act(self.rows(tensordict, self.observation_keys))
-        value = self.qvalue(acted, self.qvalue_network_params.detach())[0]
+        value = self.qvalue(acted, frozen=True)[0]
         loss = self.reduce(-value, tensordict)
         self._clear_weakrefs(tensordict, acted, "generator_params", "actor_network_params")
         return loss, {}

@@ -9,6 +9,7 @@ from weakref import WeakKeyDictionary
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 _SLOTS: WeakKeyDictionary[nn.Module, list[tuple[dict[str, Tensor], str]]] = WeakKeyDictionary()
@@ -53,6 +54,12 @@ def leaves(params: TensorDictBase) -> list[Tensor]:
     # TensorDictParams wraps each of its own methods; what it holds does not.
     params = getattr(params, "_param_td", params)
     return list(params.values(include_nested=True, leaves_only=True))
+
+
+def without_gradient(params: TensorDictBase, keys: Sequence[NestedKey]) -> TensorDictBase:
+    """The parameters, some of them detached."""
+    copy = TensorDict(params.flatten_keys(".").to_dict()).unflatten_keys(".")
+    return copy.update({key: params[key].detach() for key in keys})
 
 
 def _fill(slots: Sequence[tuple[dict[str, Tensor], str]], values: Sequence[Tensor]) -> None:
