@@ -10,47 +10,39 @@ import pytest
 import torch
 from helpers import (
     LATENT_DIM,
-    as_keywords,
+    NO_UPDATER,
     make_distillation_loss,
+    make_plas_loss,
     make_student_networks,
     make_teachers,
     numpy_decoder,
     numpy_mlp,
+    reached,
     recorded,
+    run,
     task_transitions,
+    total,
 )
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
-from torch import Tensor
+from tensordict import TensorDict, TensorDictParams
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.modules import MLP
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.objectives import MetaDistillationLoss
+from torchrl_bmrl.functional import triplet_error
+from torchrl_bmrl.modules import PLASPolicy
+from torchrl_bmrl.objectives import MetaDistillationLoss, distillation
 
 Teachers = tuple[list[TensorDictModule], list[TensorDictModule]]
 TASKS, ROWS = 3, 5
 LOC, SCALE = np.array([0.5, -1.0, 2.0]), np.array([1.0, 4.0, 0.5])
 NORMALISATION = {"qvalue_loc": torch.as_tensor(LOC), "qvalue_scale": torch.as_tensor(SCALE)}
 TERMS = ("classification", "generator", "direction", "qvalue", "latent_norm")
-CONTEXTS = ("current", "previous", "random", "set")
+ENCODER_TERMS = ("classification", "generator", "direction", "qvalue", "metric")
 
 
-def total(losses: TensorDict, *names: str) -> Tensor:
-    return sum(losses[f"loss_{name}"] for name in names or TERMS)
-
-
-def gradients(loss: MetaDistillationLoss, *names: str) -> dict[str, Tensor]:
-    """Gradient of some terms at each parameter, for the same latents."""
-    loss.zero_grad()
-    torch.manual_seed(0)
-    total(loss(task_transitions(TASKS, ROWS)), *names).backward()
-    return {
-        name: torch.zeros_like(p) if p.grad is None else p.grad.clone()
-        for name, p in loss.named_parameters()
-    }
-
-
-def networks_of(grads: dict[str, Tensor]) -> set[str]:
-    return {name.split("_params")[0] for name, grad in grads.items() if grad.any()}
+def batch() -> TensorDict:
+    return task_transitions(TASKS, ROWS)
 
 
 def expected_terms(
@@ -109,7 +101,7 @@ def test_terms_are_those_of_the_equations(context: str, deactivate_vmap: bool) -
         **NORMALISATION,
         **{f"{name}_weight": weight for name, weight in weights.items()},
     )
-    data = task_transitions(TASKS, ROWS)
+    data = batch()
     calls = recorded(loss.student_generator.module)
     losses = loss(data)
     ((_, latent, _), _), *_ = calls
@@ -140,7 +132,7 @@ def test_swapped_teachers_change_the_targets_with_them() -> None:
             reduction="none",
             **NORMALISATION,
         )
-        data = task_transitions(TASKS, ROWS)
+        data = batch()
         calls = recorded(loss.student_generator.module)
         losses = loss(data)
         terms = expected_terms(loss, teachers, data, calls[0][0][1], data)
@@ -168,10 +160,10 @@ def test_student_is_judged_at_its_own_action_and_the_teacher_at_its() -> None:
         recorded(loss.student_qvalue_network.module),
     )
     taught, valued = (
-        recorded(loss._teacher_generator.module),
-        recorded(loss._teacher_qvalue_network.module),
+        recorded(loss.teacher_generators.modules_[0].module),
+        recorded(loss.teacher_qvalue_networks.modules_[0].module),
     )
-    loss(task_transitions(TASKS, ROWS))
+    loss(batch())
     assert torch.equal(judged[0][0][1], student[0][1])
     for (_, action), ((_, seen), _) in zip(taught, valued, strict=True):
         assert torch.equal(seen, action)
@@ -182,37 +174,94 @@ def test_accuracy_is_the_share_of_rows_that_are_classified_right() -> None:
     for value in loss.task_classifier_params.values(True, True):
         value.data.zero_()
     loss.task_classifier_params["module", "bias"].data[1] = 1.0
-    assert loss(task_transitions(TASKS, ROWS))["accuracy"].item() == pytest.approx(1 / TASKS)
+    assert loss(batch())["accuracy"].item() == pytest.approx(1 / TASKS)
+
+
+def test_priority_is_the_sum_of_a_row_s_terms() -> None:
+    loss, data = make_distillation_loss(reduction="none", metric_weight=0.5), batch()
+    losses = run(loss, data)
+    torch.testing.assert_close(data["td_error"], total(losses).detach())
+
+
+# -- the metric term ---------------------------------------------------------------------------
+
+
+def test_metric_term_is_the_triplet_error_of_rows_of_the_same_and_another_task(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls = []
+
+    def spy(*inputs: Any) -> Tensor:
+        calls.append(inputs)
+        return triplet_error(*inputs)
+
+    monkeypatch.setattr(distillation, "triplet_error", spy)
+    loss = make_distillation_loss(metric_weight=0.5, metric_margin=0.3, reduction="none")
+    data = task_transitions(TASKS, 20)
+    value = run(loss, data)["loss_metric"].detach().numpy()
+    anchor, near, away = (x.detach().numpy() for x in calls[0][:3])
+    m = encode(loss, data).detach().numpy()
+    assert np.array_equal(anchor, m)
+
+    def origin(row: np.ndarray) -> tuple[int, int]:
+        ((task, index),) = np.argwhere((m == row).all(-1))
+        return task, index
+
+    for task, index in np.ndindex(TASKS, 20):
+        same, other = origin(near[task, index]), origin(away[task, index])
+        assert same[0] == task
+        assert same[1] != index
+        assert other[0] != task
+    assert {origin(away[0, index])[0] for index in range(20)} == {1, 2}
+    distance = [np.linalg.norm(anchor - x, axis=-1) for x in (near, away)]
+    expected = 0.5 * np.maximum(0, distance[0] - distance[1] + 0.3)
+    assert (expected > 0).any()
+    np.testing.assert_allclose(value, expected, atol=1e-5)
+
+
+def test_metric_term_is_zero_where_the_tasks_lie_far_apart() -> None:
+    loss = make_distillation_loss(metric_weight=1.0, metric_margin=1.0)
+    centre = 10.0 * torch.eye(TASKS, 2, dtype=torch.float64).unsqueeze(1)
+    spread = torch.rand(TASKS, ROWS, 2, dtype=torch.float64)
+    assert loss.separate(centre + spread).eq(0).all()
+    assert loss.separate(spread).gt(0).any()
+
+
+def test_metric_term_needs_two_tasks() -> None:
+    with pytest.raises(BMRLError, match="metric_weight needs at least two tasks"):
+        make_distillation_loss(num_tasks=1, metric_weight=1.0)
+    loss = make_distillation_loss(num_tasks=1)
+    assert "loss_metric" not in loss(task_transitions(1, ROWS))
 
 
 # -- gradients ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("term", "networks"),
-    [
-        ("classification", {"task_encoder", "task_classifier"}),
-        ("generator", {"task_encoder", "student_generator"}),
-        ("direction", {"task_encoder", "student_generator"}),
-        ("qvalue", {"task_encoder", "student_qvalue_network"}),
-        ("latent_norm", {"task_encoder"}),
-    ],
+    "terms",
+    [(), *((term,) for term in ENCODER_TERMS), ("generator", "qvalue"), ENCODER_TERMS],
+    ids="-".join,
 )
-def test_a_term_sends_gradients_to_its_networks_alone(term: str, networks: set[str]) -> None:
-    assert networks_of(gradients(make_distillation_loss(), term)) == networks
-    detached = make_distillation_loss(detach_task_latent=True)
-    if term not in ("classification", "latent_norm"):
-        networks = networks - {"task_encoder"}
-    assert networks_of(gradients(detached, term)) == networks
-
-
-def test_with_a_detached_embedding_cross_entropy_alone_trains_the_encoder() -> None:
-    loss = make_distillation_loss(detach_task_latent=True, latent_norm_weight=0.0)
-    whole, alone = gradients(loss), gradients(loss, "classification")
-    encoder = [name for name in whole if name.startswith("task_encoder_params")]
-    assert all(torch.equal(whole[name], alone[name]) for name in encoder)
-    attached = gradients(make_distillation_loss(latent_norm_weight=0.0))
-    assert not any(torch.equal(attached[name], alone[name]) for name in encoder)
+def test_the_chosen_terms_alone_train_the_encoder(terms: tuple[str, ...]) -> None:
+    loss = make_distillation_loss(encoder_terms=terms, metric_weight=0.5)
+    losses = run(make_distillation_loss(metric_weight=0.5), batch())
+    assert (run(loss, batch()) == losses).all()
+    own = {
+        "classification": {"task_classifier"},
+        "generator": {"student_generator"},
+        "direction": {"student_generator"},
+        "qvalue": {"student_qvalue_network"},
+        "metric": set(),
+        "latent_norm": set(),
+    }
+    for term, networks in own.items():
+        trained = {"task_encoder"} if term in (*terms, "latent_norm") else set()
+        loss.zero_grad()
+        value = run(loss, batch())[f"loss_{term}"]
+        assert value.requires_grad == bool(networks | trained)
+        if value.requires_grad:
+            value.backward()
+        assert reached(loss) == networks | trained, term
 
 
 def test_teachers_are_no_parameters_and_do_not_change() -> None:
@@ -228,7 +277,7 @@ def test_teachers_are_no_parameters_and_do_not_change() -> None:
     assert not any("teacher" in name for name, _ in loss.named_parameters())
     buffers = {name: b.clone() for name, b in loss.named_buffers() if "teacher" in name}
     optimizer = torch.optim.SGD(loss.parameters(), lr=1.0)
-    total(loss(task_transitions(TASKS, ROWS))).backward()
+    total(loss(batch())).backward()
     optimizer.step()
     after = [p for module in (*generators, *critics) for p in module.parameters()]
     assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
@@ -251,7 +300,7 @@ def test_teachers_are_copies() -> None:
     results = []
     for _ in range(2):
         torch.manual_seed(1)
-        results.append(loss(task_transitions(TASKS, ROWS)))
+        results.append(loss(batch()))
         for module in (*generators, *critics):
             for parameter in module.parameters():
                 parameter.data.add_(1.0)
@@ -263,28 +312,76 @@ def test_the_networks_given_as_the_student_are_trained_in_place() -> None:
     loss = MetaDistillationLoss(
         *networks, *make_teachers(TASKS), latent_dim=LATENT_DIM, context="current"
     )
-    total(loss(task_transitions(TASKS, ROWS))).backward()
+    total(loss(batch())).backward()
     torch.optim.SGD(loss.parameters(), lr=1.0).step()
     own = {id(p): p for network in networks for p in network.parameters()}
     trained = {id(p): p for p in loss.parameters()}
     assert own.keys() == trained.keys()
 
 
-def test_student_overfits_one_batch() -> None:
-    loss = make_distillation_loss(dtype=torch.float32, qvalue_scale=torch.full((TASKS,), 0.5))
-    optimizer = torch.optim.Adam(loss.parameters(), lr=2e-2)
-    data = task_transitions(TASKS, ROWS, dtype=torch.float32)
-    history = []
-    for _ in range(200):
-        losses = loss(data)
-        optimizer.zero_grad()
-        total(losses).backward()
-        optimizer.step()
-        history.append(losses.detach())
-    first, last = history[0], torch.stack(history[-10:]).mean(0)
-    assert last["accuracy"] == 1.0
-    for name in ("classification", "generator", "direction", "qvalue"):
-        assert last[f"loss_{name}"] < 0.3 * first[f"loss_{name}"], name
+# -- teachers of any kind ----------------------------------------------------------------------
+
+
+def widened(module: TensorDictModule) -> TensorDictModule:
+    """The same function by a wider network, whose further units are always zero."""
+    module = deepcopy(module)
+    network = module.module if isinstance(module.module, MLP) else module.module.network
+    first, last = network[0], network[2]
+    for layer, name in ((first, "weight"), (first, "bias")):
+        value = getattr(layer, name).data
+        setattr(layer, name, nn.Parameter(torch.cat([value, torch.zeros_like(value)])))
+    more = torch.randn_like(last.weight.data)
+    last.weight = nn.Parameter(torch.cat([last.weight.data, more], -1))
+    return module
+
+
+def test_teachers_of_different_widths_teach_as_equally_wide_ones() -> None:
+    torch.manual_seed(1)
+    generators, critics = make_teachers(TASKS)
+    stacked = make_distillation_loss(teachers=(generators, critics))
+    generators[1], critics[2] = widened(generators[1]), widened(critics[2])
+    looped = make_distillation_loss(teachers=(generators, critics))
+    assert stacked.teacher_generators.stacked
+    assert stacked.teacher_qvalue_networks.stacked
+    assert not looped.teacher_generators.stacked
+    assert not looped.teacher_qvalue_networks.stacked
+    results = [run(loss, batch()).detach().to_dict() for loss in (stacked, looped)]
+    torch.testing.assert_close(*results, rtol=1e-10, atol=0)
+    fresh = make_distillation_loss(teachers=(generators, critics), seed=1)
+    fresh.load_state_dict(looped.state_dict(), strict=True)
+    assert (run(fresh, batch()) == run(looped, batch())).all()
+
+
+@pytest.mark.filterwarnings(NO_UPDATER)
+def test_decoders_and_critics_of_plas_are_teachers() -> None:
+    experts = [make_plas_loss(seed=seed) for seed in range(TASKS)]
+    decoders = [PLASPolicy.from_loss(expert).decoder for expert in experts]
+    critics = []
+    for expert in experts:
+        critic, params = expert.critic(0)
+        critics.append(deepcopy(critic))
+        TensorDictParams(params.data.clone()).to_module(critics[-1], preserve_module_state=False)
+    loss, data = make_distillation_loss(teachers=(decoders, critics)), batch()
+    taught = loss.teach(data)
+    for i, expert in enumerate(experts):
+        observation, latent = data["observation"][i], taught["action_latent"][i]
+        row = TensorDict({"observation": observation}, [ROWS])
+        decoded = expert.decode(row, latent)
+        torch.testing.assert_close(taught["action"][i], decoded["action"])
+        value = expert.qvalue(decoded)[0]
+        torch.testing.assert_close(taught["state_action_value"][i].squeeze(-1), value)
+    total(loss(data)).backward()
+
+
+def test_teachers_may_hold_dropout_that_no_other_network_holds() -> None:
+    generators, critics = make_teachers(TASKS)
+    value = ["state_action_value"]
+    critics = [
+        TensorDictSequential(critic, TensorDictModule(nn.Dropout(0.5), value, value))
+        for critic in critics
+    ]
+    loss = make_distillation_loss(teachers=(generators, critics))
+    loss(batch())
 
 
 # -- where m comes from ------------------------------------------------------------------------
@@ -364,129 +461,10 @@ def test_data_without_the_previous_transition_are_refused_by_name() -> None:
         loss(data)
     loss.set_keys(previous="before")
     with pytest.raises(BMRLError, match="no 'before'"):
-        loss(task_transitions(TASKS, ROWS))
-
-
-# -- TorchRL's contract ------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("context", CONTEXTS)
-def test_keyword_dispatch_returns_the_out_keys_in_order(context: str) -> None:
-    loss = make_distillation_loss(context=context)
-    data = task_transitions(TASKS, ROWS)
-    torch.manual_seed(0)
-    expected = loss(data)
-    assert set(expected.keys()) == set(loss.out_keys)
-    torch.manual_seed(0)
-    result = loss(**as_keywords(data, loss.in_keys))
-    for key, value in zip(loss.out_keys, result, strict=True):
-        assert torch.equal(value, expected[key]), key
-
-
-@pytest.mark.parametrize("context", CONTEXTS)
-def test_forward_leaves_the_input_and_detaches_what_is_no_loss(context: str) -> None:
-    loss = make_distillation_loss(context=context)
-    data = task_transitions(TASKS, ROWS)
-    before = data.clone()
-    for key, value in loss(data).items():
-        assert value.requires_grad == key.startswith("loss_")
-    assert set(data.keys(True)) == set(before.keys(True))
-    assert (data == before).all()
-
-
-def test_select_out_keys_keeps_only_those() -> None:
-    loss = make_distillation_loss()
-    loss.select_out_keys("loss_generator")
-    assert list(loss(task_transitions(TASKS, ROWS)).keys()) == ["loss_generator"]
-    assert len(make_distillation_loss().out_keys) == 7
-
-
-def test_renamed_keys_give_the_same_losses() -> None:
-    loss = make_distillation_loss(context="previous")
-    data = task_transitions(TASKS, ROWS)
-    torch.manual_seed(0)
-    expected = loss(data)
-    loss.set_keys(task=("info", "class"), previous=("info", "before"))
-    data["info"] = TensorDict(
-        {"class": data.pop("task"), "before": data.pop("previous")}, data.shape
-    )
-    assert ("info", "before", "next", "reward") in loss.in_keys
-    torch.manual_seed(0)
-    assert (loss(data) == expected).all()
-    torch.manual_seed(0)
-    result = loss(**as_keywords(data, loss.in_keys))
-    assert torch.equal(result[0], expected["loss_classification"])
-
-
-def test_state_dict_round_trip_brings_teachers_and_student_along() -> None:
-    loss, other = make_distillation_loss(), make_distillation_loss(seed=1)
-    before = set(loss.state_dict())
-    loss(task_transitions(TASKS, ROWS))
-    assert set(loss.state_dict()) == before
-    other.load_state_dict(deepcopy(loss.state_dict()), strict=True)
-    copy = deepcopy(loss)
-    results = []
-    for module in (loss, other, copy):
-        torch.manual_seed(0)
-        results.append(module(task_transitions(TASKS, ROWS)))
-    assert (results[0] == results[1]).all()
-    assert (results[0] == results[2]).all()
-    total(results[2]).backward()
-    assert all(p.grad is None for p in loss.parameters())
-
-
-@pytest.mark.parametrize("term", TERMS)
-def test_reductions_masks_and_priority_weights_agree(term: str) -> None:
-    loss, key = make_distillation_loss(), f"loss_{term}"
-    data = task_transitions(TASKS, ROWS)
-
-    def value(reduction: str) -> Tensor:
-        loss.reduction = reduction
-        torch.manual_seed(0)
-        return loss(data)[key]
-
-    rows = value("none")
-    assert rows.shape == (TASKS, ROWS)
-    torch.testing.assert_close(value("sum"), rows.sum())
-    torch.testing.assert_close(value("mean"), rows.mean())
-    mask = torch.arange(ROWS).expand(TASKS, ROWS) != 1
-    data["collector", "mask"] = mask
-    torch.testing.assert_close(value("mean"), rows[mask].mean())
-    del data["collector"]
-    weight = torch.linspace(0.1, 1, TASKS * ROWS, dtype=torch.float64).view(TASKS, ROWS)
-    data["priority_weight"] = weight
-    torch.testing.assert_close(value("mean"), (rows * weight).sum() / weight.sum())
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_losses_have_the_dtype_of_networks_and_data(dtype: torch.dtype) -> None:
-    losses = make_distillation_loss(dtype=dtype)(task_transitions(TASKS, ROWS, dtype=dtype))
-    assert {value.dtype for value in losses.values()} == {dtype}
+        loss(batch())
 
 
 # -- arguments ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("shape", [(ROWS,), (TASKS + 1, ROWS), (TASKS, ROWS, 1)])
-def test_data_that_are_not_one_row_per_teacher_are_refused(shape: tuple[int, ...]) -> None:
-    data = TensorDict({"observation": torch.zeros(*shape, 3)}, batch_size=shape)
-    with pytest.raises(BMRLError, match=r"valid: \[3, B\], one row per teacher"):
-        make_distillation_loss()(data)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"context": "next"}, "'next'; valid .*: current, previous, random, set"),
-        ({"context_fraction": 1.5}, "context_fraction is 1.5; valid: between 0 and 1"),
-        ({"context_size": 0}, "context_size is 0; valid: at least 1"),
-    ],
-)
-def test_bad_options_are_refused_with_the_valid_values(
-    options: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(BMRLError, match=message):
-        make_distillation_loss(**options)
 
 
 def test_as_many_generators_as_critics_are_needed() -> None:

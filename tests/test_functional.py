@@ -125,6 +125,46 @@ def test_direction_error_of_a_zero_action_is_finite_with_its_gradient() -> None:
     assert action.grad.isfinite().all()
 
 
+@pytest.mark.parametrize("threshold", [0.0, 0.3, 1.0])
+def test_likely_actions_are_those_near_the_likeliest(
+    threshold: float, rng: np.random.Generator
+) -> None:
+    logits = rng.normal(size=(2, 50, 4))
+    probability = np.exp(logits) / np.exp(logits).sum(-1, keepdims=True)
+    expected = probability / probability.max(-1, keepdims=True) > threshold
+    if threshold == 1:  # no ratio is above one, but the likeliest action is always allowed
+        assert not expected.any()
+        expected = probability == probability.max(-1, keepdims=True)
+    result = functional.likely_actions(torch.as_tensor(logits), threshold)
+    assert result.dtype == torch.bool
+    assert np.array_equal(result.numpy(), expected)
+
+
+def test_likely_actions_of_extreme_logits_are_never_none() -> None:
+    logits = torch.tensor([[1e4, -1e4], [-1e4, -1e4], [0.0, -torch.inf]])
+    for threshold in (0.0, 0.3, 1.0):
+        likely = functional.likely_actions(logits, threshold)
+        assert likely.tolist() == [[True, False], [True, True], [True, False]]
+
+
+def test_triplet_error_is_the_hinge_of_the_two_distances(rng: np.random.Generator) -> None:
+    a, near, far = rng.normal(size=(3, 4, 6, 3))
+    distance = [np.linalg.norm(a - x, axis=-1) for x in (near, far)]
+    expected = np.maximum(0, distance[0] - distance[1] + 0.5)
+    assert (expected == 0).any()
+    result = functional.triplet_error(*map(torch.as_tensor, (a, near, far)), 0.5)
+    # PyTorch adds 1e-6 to every difference, so that the root has a gradient at zero.
+    np.testing.assert_allclose(result, expected, atol=1e-5)
+
+
+def test_triplet_error_of_equal_embeddings_is_the_margin_with_a_finite_gradient() -> None:
+    m = torch.zeros(2, 3, requires_grad=True)
+    error = functional.triplet_error(m, m, m, 0.7)
+    error.sum().backward()
+    torch.testing.assert_close(error.detach(), torch.full((2,), 0.7))
+    assert m.grad.isfinite().all()
+
+
 @pytest.mark.parametrize(
     ("equation", "shapes"),
     [

@@ -6,8 +6,10 @@ from math import isfinite
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.objectives import LossModule
 
 from torchrl_bmrl.errors import BMRLError
 
@@ -92,3 +94,29 @@ def missing(tensordict: TensorDictBase, key: NestedKey) -> BMRLError:
     """The error for an entry that the data lack."""
     present = [str(key) for key in tensordict.keys(include_nested=True, leaves_only=True)]
     return BMRLError(f"the data have no {key!r}; they have: {', '.join(present) or 'nothing'}")
+
+
+def priority_weight(loss: LossModule, tensordict: TensorDictBase) -> Tensor | None:
+    """Weights of the rows, also under a nested key, which TorchRL's own does not find."""
+    if loss.use_prioritized_weights not in (True, "auto"):
+        return None
+    return tensordict.get(loss.tensor_keys.priority_weight, None)
+
+
+def read(module: TensorDictModule, tensordict: TensorDictBase) -> TensorDictBase:
+    """Runs a network on the data.
+
+    Raises:
+        BMRLError: naming what it reads, with the shapes, if they do not fit it.
+    """
+    if torch.compiler.is_compiling():
+        return module(tensordict)
+    try:
+        return module(tensordict)
+    except torch.OutOfMemoryError:
+        raise
+    except RuntimeError as error:
+        shapes = ", ".join(f"{key!r} {tuple(tensordict[key].shape)}" for key in module.in_keys)
+        raise BMRLError(
+            f"a network cannot read {shapes} ({error}); valid: the sizes that it was made for"
+        ) from error

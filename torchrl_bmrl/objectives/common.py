@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
 import torch
-from tensordict import TensorDictBase, TensorDictParams
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -23,7 +23,7 @@ from torchrl.objectives.utils import (
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.objectives.checks import entry, missing, next_key
+from torchrl_bmrl.objectives.checks import entry, missing, next_key, priority_weight
 from torchrl_bmrl.objectives.swap import holding, leaves, without_gradient
 
 LOSS_FUNCTIONS = ("l2", "l1", "smooth_l1")
@@ -411,6 +411,9 @@ class OfflineLoss(LossModule):
             "next_state_value": next_value.detach().mean(),
         }
 
+    def _maybe_get_priority_weight(self, tensordict: TensorDictBase) -> Tensor | None:
+        return priority_weight(self, tensordict)
+
     def reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
         """Reduces ``(*B,)`` with the data's masks and priority weights."""
         weights = self._maybe_get_priority_weight(tensordict)
@@ -435,18 +438,17 @@ class OfflineLoss(LossModule):
             BMRLError: for a missing key, a number that is not finite, or another batch shape.
         """
         batch = self.batch_shape(tensordict)
-        result = (tensordict.get("next") if after else tensordict).select(*keys)
-        if not torch.compiler.is_compiling():
-            for key in keys:
-                full = next_key(key) if after else key
-                value = entry(tensordict, full)
-                if value.shape[: len(batch)] != batch:
-                    raise BMRLError(
-                        f"{full!r} has the shape {tuple(value.shape)}; valid: {tuple(batch)} and "
-                        "its own dimensions, as the action has"
-                    )
-        if result.batch_size != batch:
-            result.batch_size = batch
+        # Made new: what a keyword call nests has a batch size of its own.
+        result = TensorDict({}, batch_size=batch)
+        for key in keys:
+            full = next_key(key) if after else key
+            value = entry(tensordict, full)
+            if value.shape[: len(batch)] != batch:
+                raise BMRLError(
+                    f"{full!r} has the shape {tuple(value.shape)}; valid: {tuple(batch)} and its "
+                    "own dimensions, as the action has"
+                )
+            result.set(key, value)
         return result
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.functional import likely_actions
-from torchrl_bmrl.objectives.checks import missing, next_key
+from torchrl_bmrl.objectives.checks import entry, missing, next_key
 from torchrl_bmrl.objectives.common import OfflineLoss
 
 ACTION_SPACES = ("one-hot", "categorical")
@@ -173,7 +173,7 @@ class DiscreteBCQLoss(OfflineLoss):
         action = tensordict.get(key, None)
         if action is None:
             raise missing(tensordict, key)
-        if self.action_space == "categorical" and action.ndim == tensordict.ndim:
+        if self.action_space == "categorical" and action.ndim == max(tensordict.ndim, 1):
             return action.shape
         return action.shape[:-1]
 
@@ -184,7 +184,7 @@ class DiscreteBCQLoss(OfflineLoss):
             BMRLError: for an action that is not written as ``action_space`` says.
         """
         key, batch = self.tensor_keys.action, self.batch_shape(tensordict)
-        action = tensordict.get(key)
+        action = entry(tensordict, key)
         width = num_actions if self.action_space == "one-hot" else 1
         if action.shape not in (batch, (*batch, width)):
             raise BMRLError(
@@ -193,7 +193,14 @@ class DiscreteBCQLoss(OfflineLoss):
             )
         if self.action_space == "one-hot":
             return action.to(torch.uint8).argmax(-1)
-        return action.reshape(batch)
+        action = action.reshape(batch)
+        if not torch.compiler.is_compiling() and action.device.type == "cpu":
+            low, high = int(action.min()), int(action.max())
+            if low < 0 or high >= num_actions:
+                raise BMRLError(
+                    f"{key!r} holds {low if low < 0 else high}; valid: 0 to {num_actions - 1}"
+                )
+        return action
 
     def logits(self, tensordict: TensorDictBase, *, after: bool = False) -> Tensor:
         """Logits of the generator at the state or the one ``after``, ``(*B, n)``."""

@@ -20,7 +20,7 @@ from torchrl_bmrl.functional import (
     squared_error,
     triplet_error,
 )
-from torchrl_bmrl.objectives.checks import entry
+from torchrl_bmrl.objectives.checks import entry, priority_weight, read
 from torchrl_bmrl.objectives.common import REDUCTIONS
 from torchrl_bmrl.objectives.ensemble import FrozenEnsemble
 
@@ -256,6 +256,9 @@ class MetaDistillationLoss(LossModule):
         # Found once and kept: found at the first call, it would make a compiled loss compile again.
         self.set_vmap_randomness(self.vmap_randomness)
 
+    def _maybe_get_priority_weight(self, tensordict: TensorDictBase) -> Tensor | None:
+        return priority_weight(self, tensordict)
+
     def _make_vmap(self) -> None:
         """Nothing is cached that ``set_vmap_randomness`` would have to renew."""
 
@@ -322,6 +325,8 @@ class MetaDistillationLoss(LossModule):
                     "reads; valid: data of torchrl_bmrl.data.with_previous, or another context: "
                     + ", ".join(name for name in CONTEXTS if name != "previous")
                 )
+            for key in keys:
+                entry(tensordict, unravel_key((self.tensor_keys.previous, key)))
             other = self._encode(previous.select(*keys))
         else:
             # Rows of a task are draws from its data: others of the same row are its context.
@@ -334,7 +339,7 @@ class MetaDistillationLoss(LossModule):
 
     def _encode(self, transition: TensorDictBase) -> Tensor:
         with self.task_encoder_params.to_module(self.task_encoder, preserve_module_state=False):
-            return self.task_encoder(transition).get(self.tensor_keys.task_latent)
+            return read(self.task_encoder, transition).get(self.tensor_keys.task_latent)
 
     @torch.no_grad()
     def teach(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -410,6 +415,11 @@ class MetaDistillationLoss(LossModule):
                 f"[{self.num_tasks}, B], one row per teacher"
             )
         task = entry(tensordict, self.tensor_keys.task)
+        if task.shape != tensordict.batch_size:
+            raise BMRLError(
+                f"{self.tensor_keys.task!r} has the shape {tuple(task.shape)}; valid: "
+                f"{tuple(tensordict.batch_size)}"
+            )
         m = self.embed(tensordict)
         reaching = {term: m if term in self.encoder_terms else m.detach() for term in ENCODER_TERMS}
         logits = self.classify(reaching["classification"])

@@ -40,7 +40,7 @@ class FrozenEnsemble(nn.Module):
         self.in_keys = list(dict.fromkeys(key for module in modules for key in module.in_keys))
         params = [TensorDict.from_module(module).data.clone() for module in modules]
         shapes = [
-            {key: value.shape for key, value in each.items(True, True)} | {"": str(module)}
+            {key: value.shape for key, value in each.items(True, True)} | {"": _kind(module)}
             for each, module in zip(params, modules, strict=True)
         ]
         self.stacked = all(each == shapes[0] for each in shapes)
@@ -50,7 +50,7 @@ class FrozenEnsemble(nn.Module):
             self.params = nn.ModuleList(TensorDictParams(each, no_convert=True) for each in params)
         # Outside _modules: kept for their structure, their own parameters are no state of the loss.
         needed = modules[:1] if self.stacked else modules
-        self.__dict__["modules_"] = [deepcopy(module).to("meta") for module in needed]
+        self.__dict__["modules_"] = [deepcopy(module).to("meta").eval() for module in needed]
 
     def forward(
         self, data: TensorDictBase, *, randomness: str = "error", loop: bool = False
@@ -70,3 +70,12 @@ class FrozenEnsemble(nn.Module):
             with params.to_module(module, preserve_module_state=False):
                 rows.append(module(row.copy()))
         return torch.stack(rows)
+
+
+def _kind(module: nn.Module) -> str:
+    """What tells modules apart beside their parameters: structure and plain attributes."""
+    attributes = [
+        {name: value for name, value in vars(part).items() if not name.startswith("_")}
+        for part in module.modules()
+    ]
+    return f"{module} {attributes}"

@@ -20,7 +20,7 @@ from torchrl_bmrl.functional import (
     sample_action_latent,
     squared_error,
 )
-from torchrl_bmrl.objectives.checks import check_same_shape, next_key
+from torchrl_bmrl.objectives.checks import check_same_shape, next_key, read
 from torchrl_bmrl.objectives.common import OfflineLoss
 from torchrl_bmrl.objectives.swap import holding
 
@@ -183,7 +183,7 @@ class GenerativeLoss(OfflineLoss):
         )
         action = data.get(keys.action)
         with holding(self.generator, self.weights("generator")):
-            data = self.generator.encoder(data)
+            data = read(self.generator.encoder, data)
             loc, scale = data.get(keys.action_latent_loc), data.get(keys.action_latent_scale)
             data.set(keys.action_latent, loc + scale * torch.randn_like(scale))
             reconstruction = self.generator.decoder(data).get(keys.action)
