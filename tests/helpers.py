@@ -5,7 +5,11 @@ Everything is float64, so that an independent numpy computation can be compared 
 
 from __future__ import annotations
 
+import re
+import sys
 from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -26,7 +30,13 @@ from torchrl_bmrl.modules import (
     make_task_classifier,
     make_task_encoder,
 )
-from torchrl_bmrl.objectives import BCQLoss, DiscreteBCQLoss, MetaDistillationLoss, PLASLoss
+from torchrl_bmrl.objectives import (
+    BCQLoss,
+    DiscreteBCQLoss,
+    GenerativeLoss,
+    MetaDistillationLoss,
+    PLASLoss,
+)
 
 OBSERVATION_DIM, ACTION_DIM, LATENT_DIM, TASK_LATENT_DIM = 3, 2, 4, 2
 NUM_ACTIONS = 3
@@ -161,6 +171,36 @@ def make_bcq_loss(
         make_generator(dtype, edit),
         make_critics(num_critics, dtype, edit) if critics is None else critics,
         make_perturbation(dtype, edit) if perturbation else None,
+        **{"bounds": (-1.0, 1.0), **options},
+    )
+    return with_moved_targets(loss)
+
+
+def guide() -> ModuleType:
+    """The code of docs/extending.md as a module, so that what it defines can be pickled."""
+    if "extending" not in sys.modules:
+        page = Path(__file__).parents[1] / "docs" / "extending.md"
+        blocks = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+        sys.modules["extending"] = module = ModuleType("extending")
+        exec(compile("\n".join(blocks), page.name, "exec"), vars(module))
+    return sys.modules["extending"]
+
+
+def make_emaq_loss(
+    *,
+    num_critics: int = 2,
+    critics: Any = None,
+    dtype: torch.dtype = torch.float64,
+    seed: int = 0,
+    edit: Edit = unchanged,
+    **options: Any,
+) -> GenerativeLoss:
+    """The loss that docs/extending.md builds, small, its targets apart from what is trained."""
+    build = guide().EMaQLoss  # draws random numbers when it runs for the first time
+    torch.manual_seed(seed)
+    loss = build(
+        make_generator(dtype, edit),
+        make_critics(num_critics, dtype, edit) if critics is None else critics,
         **{"bounds": (-1.0, 1.0), **options},
     )
     return with_moved_targets(loss)
