@@ -22,6 +22,7 @@ from time import perf_counter
 from typing import Any
 
 import torch
+import torch._inductor.config
 from plain_bcq import PlainBCQ
 from tensordict import TensorDict
 from torch import Tensor, nn
@@ -180,6 +181,9 @@ def main(arguments: list[str] | None = None) -> None:
         parser.add_argument(name, **option)
     args = parser.parse_args(arguments)
     torch.set_num_threads(1)
+    # The compiler's own random numbers are slow on CPU; with eager's a compiled loss also draws
+    # what the eager one draws.
+    torch._inductor.config.fallback_random = True
 
     results = {
         rows: measure(rows, rounds=args.rounds, updates=args.updates) for rows in args.batch_sizes

@@ -438,16 +438,19 @@ class OfflineLoss(LossModule):
             BMRLError: for a missing key, a number that is not finite, or another batch shape.
         """
         batch = self.batch_shape(tensordict)
-        # Made new: what a keyword call nests has a batch size of its own.
-        result = TensorDict({}, batch_size=batch)
-        for key in keys:
-            full = next_key(key) if after else key
-            value = entry(tensordict, full)
+        values = {key: entry(tensordict, next_key(key) if after else key) for key in keys}
+        for key, value in values.items():
             if value.shape[: len(batch)] != batch:
+                full = next_key(key) if after else key
                 raise BMRLError(
                     f"{full!r} has the shape {tuple(value.shape)}; valid: {tuple(batch)} and its "
                     "own dimensions, as the action has"
                 )
+        if tensordict.batch_size == batch and all(isinstance(key, str) for key in values):
+            return (tensordict.get("next") if after else tensordict).select(*values)
+        # Made new: what a keyword call nests has a batch size of its own.
+        result = TensorDict({}, batch_size=batch)
+        for key, value in values.items():
             result.set(key, value)
         return result
 
