@@ -16,11 +16,12 @@ import os
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 import csv
+import importlib
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,8 +32,13 @@ import torch
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule, TensorDictSequential
-from torch import nn
+from tensordict.nn import (
+    AddStateIndependentNormalScale,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
+from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import (
@@ -72,257 +78,209 @@ class Settings:
 
     run_dir: str = "runs/extrapolation-${env}"
     workers: int = 2  # processes; does not change any result
-    env: str = "Hopper-v5"
+    env: str = "HalfCheetah-v5"
     seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
     algorithms: list[str] = field(default_factory=lambda: list(ALGORITHMS))
-    behaviour_steps: int = 20_000  # of the online agent, one update each
+    behaviour_steps: int = 40_000  # of the online agent
     exploration_steps: int = 2_000  # the first of these: random actions, no update
+    steps_per_update: int = 2  # of the online agent
     noise: float = 0.1  # standard deviation on the behaviour's actions, online and in the batch
     batch_steps: int = 20_000  # transitions that the offline algorithms see
-    updates: int = 10_000  # of each offline algorithm
+    updates: int = 4_000  # of each offline algorithm
     batch_size: int = 128
     lr: float = 1e-3
     tau: float = 0.005
-    eval_episodes: int = 10  # of each trained policy
+    eval_episodes: int = 5  # of each trained policy
 
 
-# -- networks, of equal size everywhere; actions are scaled to [-1, 1] -----------------------------
+# -- offline algorithms: from the sizes of observation and action to a loss and its policy ---------
+
+Algorithm = tuple[LossModule, Callable[[], TensorDictModuleBase]]
+BOUNDS = (-1.0, 1.0)  # the environment scales the actions
+CELLS = (256, 256)  # of every network
 
 
 def make_actor(observation_dim: int, action_dim: int) -> TensorDictModule:
     """Deterministic policy."""
-    network = nn.Sequential(make_mlp(observation_dim, action_dim, (256, 256)), nn.Tanh())
+    network = nn.Sequential(make_mlp(observation_dim, action_dim, CELLS), nn.Tanh())
     return TensorDictModule(network, in_keys=["observation"], out_keys=["action"])
 
 
 def make_critics(observation_dim: int, action_dim: int) -> list[TensorDictModule]:
     """Twin critics."""
-    return [make_qvalue_network(observation_dim, action_dim) for _ in range(2)]
+    return [make_qvalue_network(observation_dim, action_dim, num_cells=CELLS) for _ in range(2)]
 
 
-# -- offline algorithms: (observation_dim, action_dim) to a loss and a function to its policy ------
-
-Algorithm = Callable[[int, int], tuple[LossModule, Callable[[], Any]]]
-BOUNDS = (-1.0, 1.0)
-
-
-def ddpg(*dims: int) -> tuple[LossModule, Callable[[], Any]]:
+def ddpg(*dims: int) -> Algorithm:
     """Off-policy: nothing keeps its actions near the batch."""
     actor = make_actor(*dims)
-    return DDPGLoss(actor, make_qvalue_network(*dims), delay_actor=True), lambda: actor
+    return DDPGLoss(actor, make_critics(*dims)[0], delay_actor=True), lambda: actor
 
 
-def bc(*dims: int) -> tuple[LossModule, Callable[[], Any]]:
+def bc(*dims: int) -> Algorithm:
     """Imitation."""
+    # TorchRL's BCLoss has no targets and does not say so.
+    warnings.filterwarnings("ignore", "The name target_actor_network_params wasn't part of")
     actor = make_actor(*dims)
     return BCLoss(actor), lambda: actor
 
 
-def td3_bc(*dims: int) -> tuple[LossModule, Callable[[], Any]]:
+def td3_bc(*dims: int) -> Algorithm:
     """TD3 with an imitation term."""
     actor = make_actor(*dims)
     loss = TD3BCLoss(actor, make_critics(*dims), bounds=BOUNDS, loss_function="l2")
     return loss, lambda: actor
 
 
-def iql(observation_dim: int, action_dim: int) -> tuple[LossModule, Callable[[], Any]]:
-    """Expectile values, advantage-weighted imitation."""
-    network = nn.Sequential(
-        make_mlp(observation_dim, action_dim, (256, 256)),
-        nn.Tanh(),
-        AddStateIndependentNormalScale(action_dim),
-    )
+def iql(*dims: int) -> Algorithm:
+    """Expectile values and advantage-weighted imitation, with the published coefficients."""
+    network = nn.Sequential(make_actor(*dims).module, AddStateIndependentNormalScale(dims[1]))
     keys = ["loc", "scale"]
-    actor = ProbabilisticActor(
-        TensorDictModule(network, in_keys=["observation"], out_keys=keys),
-        in_keys=keys,
-        distribution_class=IndependentNormal,
-    )
-    value = TensorDictModule(
-        make_mlp(observation_dim, 1, (256, 256)), in_keys=["observation"], out_keys=["state_value"]
-    )
-    critics = make_critics(observation_dim, action_dim)
-    loss = IQLLoss(
-        actor, critics, value, temperature=3.0, expectile=0.7, loss_function="l2"
-    )  # as published
-    return loss, lambda: actor
+    network = TensorDictModule(network, in_keys=["observation"], out_keys=keys)
+    actor = ProbabilisticActor(network, in_keys=keys, distribution_class=IndependentNormal)
+    value = make_mlp(dims[0], 1, CELLS)
+    value = TensorDictModule(value, in_keys=["observation"], out_keys=["state_value"])
+    options = {"temperature": 3.0, "expectile": 0.7, "loss_function": "l2"}
+    return IQLLoss(actor, make_critics(*dims), value, **options), lambda: actor
 
 
-def plas(observation_dim: int, action_dim: int) -> tuple[LossModule, Callable[[], Any]]:
-    """A policy in the latent space of a generator that is trained first."""
-    generator = ActionVAE(observation_dim, action_dim)
-    actor = make_latent_actor(observation_dim, generator.latent_dim)
-    loss = PLASLoss(generator, actor, make_critics(observation_dim, action_dim), bounds=BOUNDS)
+def plas(*dims: int) -> Algorithm:
+    """A policy that chooses the latent of a generator of the batch's actions."""
+    generator = ActionVAE(*dims, num_cells=CELLS)
+    # Published: 2. BCQ's 0.5 keeps to latents that so short a training has seen.
+    actor = make_latent_actor(dims[0], generator.latent_dim, num_cells=CELLS, max_latent=0.5)
+    loss = PLASLoss(generator, actor, make_critics(*dims), bounds=BOUNDS)
     return loss, lambda: PLASPolicy.from_loss(loss)
 
 
-def bcq(*dims: int) -> tuple[LossModule, Callable[[], Any]]:
+def bcq(*dims: int) -> Algorithm:
     """The best of what a generator of the batch's actions proposes."""
-    loss = BCQLoss(ActionVAE(*dims), make_critics(*dims), bounds=BOUNDS)
+    loss = BCQLoss(ActionVAE(*dims, num_cells=CELLS), make_critics(*dims), bounds=BOUNDS)
     return loss, lambda: BCQPolicy.from_loss(loss)
 
 
-ALGORITHMS: dict[str, Algorithm] = {
-    "ddpg": ddpg,
-    "bc": bc,
-    "td3_bc": td3_bc,
-    "iql": iql,
-    "plas": plas,
-    "bcq": bcq,
-}
-WARMUP = {"plas": 0.3}  # share of the updates that train the generator alone
+ALGORITHMS = {build.__name__: build for build in (ddpg, bc, td3_bc, iql, plas, bcq)}
+WARMUP = {"plas": 0.3}  # first share of the updates: the generator alone, held afterwards
 
 
 # -- the experiment --------------------------------------------------------------------------------
 
-Row = dict[str, str | int | float]
-"""``algorithm``, ``seed``, ``episode``, ``return``; the batch's own episodes are ``behaviour``."""
-
-TRANSITION = (
-    "observation",
-    "action",
-    *(("next", key) for key in ("observation", "reward", "done", "terminated")),
-)
+BEHAVIOUR = "behaviour"
+Row = dict[str, Any]
+"""Of ``results.csv``: algorithm, seed, episode, return."""
 
 
-def make_env(name: str) -> EnvBase:
-    """The task with actions in [-1, 1] and the return so far."""
-    return TransformedEnv(GymEnv(name), Compose(ActionScaling(), DoubleToFloat(), RewardSum()))
+def make_env(name: str) -> tuple[EnvBase, tuple[int, int]]:
+    """The task with actions in [-1, 1], and the sizes of observation and action."""
+    env = TransformedEnv(GymEnv(name), Compose(ActionScaling(), DoubleToFloat(), RewardSum()))
+    return env, (env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1])
 
 
-def dimensions(env: EnvBase) -> tuple[int, int]:
-    """Sizes of the observation and the action."""
-    return env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
+def make_buffer(size: int, settings: Settings) -> TensorDictReplayBuffer:
+    """Transitions, sampled one by one."""
+    return TensorDictReplayBuffer(storage=LazyTensorStorage(size), batch_size=settings.batch_size)
 
 
-def make_buffer(size: int, batch_size: int) -> TensorDictReplayBuffer:
-    """Transitions in memory, sampled one by one."""
-    return TensorDictReplayBuffer(storage=LazyTensorStorage(size), batch_size=batch_size)
+def make_update(loss: LossModule, settings: Settings) -> Callable[[Tensor], None]:
+    """One step of Adam on every parameter of a loss, then one of its targets."""
+    optimizer = torch.optim.Adam(loss.parameters(), lr=settings.lr)
+    has_targets = any(key.startswith("target_") for key in loss.state_dict())
+    targets = SoftUpdate(loss, tau=settings.tau) if has_targets else None
+
+    def update(value: Tensor) -> None:
+        optimizer.zero_grad(set_to_none=True)
+        value.backward()
+        optimizer.step()
+        if targets is not None:
+            targets.step()
+
+    return update
+
+
+def total(losses: TensorDictBase) -> Tensor:
+    """Sum of what a loss wants minimised."""
+    return sum(value for key, value in losses.items() if key.startswith("loss_"))
 
 
 def collect(
-    env: EnvBase, policy: TensorDictSequential, steps: int, random_steps: int = 0
+    env: EnvBase, policy: TensorDictModuleBase, steps: int, report: Report, random_steps: int = 0
 ) -> Iterator[TensorDictBase]:
-    """Transitions of an exploring policy, at most 100 at a time."""
-    collector = Collector(
+    """Transitions of an exploring policy, 100 at a time."""
+    for data in Collector(
         env,
         policy,
         frames_per_batch=min(100, steps),
         total_frames=steps,
         init_random_frames=random_steps,
         auto_register_policy_transforms=True,
-    )
-    for data in collector:
+    ):
         yield data.exclude("collector")
+        report(len(data))
 
 
-def make_updater(loss: LossModule, settings: Settings) -> Callable[..., torch.Tensor]:
-    """One step of Adam on the sum of the losses, then one of the targets."""
-    optimizer = torch.optim.Adam(loss.parameters(), lr=settings.lr)
-    has_targets = any(key.startswith("target_") for key in loss.state_dict())
-    targets = SoftUpdate(loss, tau=settings.tau) if has_targets else None
-
-    def update(batch: TensorDictBase, generator_only: bool = False) -> torch.Tensor:
-        if generator_only:
-            value, _ = loss.generator_loss(batch)
-        else:
-            value = sum(term for key, term in loss(batch).items() if key.startswith("loss_"))
-        optimizer.zero_grad(set_to_none=True)
-        value.backward()
-        optimizer.step()
-        if targets is not None:
-            targets.step()
-        return value.detach()
-
-    return update
-
-
-def batch_job(job: tuple[Settings, int], report: Report) -> list[Row]:
-    """Trains a seed's behaviour online and keeps a batch of its episodes; their returns."""
-    settings, seed = job
-    path = batch_path(settings, seed)
-    if path.exists():
-        report(settings.behaviour_steps + settings.batch_steps)
-        returns = load_checkpoint(path, kind="batch")[0]["returns"]
-        return make_rows("behaviour", seed, returns.tolist())
+def make_batch(settings: Settings, seed: int, report: Report) -> list[float]:
+    """Trains a seed's behaviour online and keeps a batch of its steps; its episodes' returns."""
     torch.manual_seed(derive_seed(seed, "behaviour"))
-    with closing(make_env(settings.env)) as env:
-        env.set_seed(derive_seed(seed, "behaviour", "env"))
-        actor = make_actor(*dimensions(env))
-        loss = TD3Loss(
-            actor, make_critics(*dimensions(env)), action_spec=env.action_spec, loss_function="l2"
-        )
-        update = make_updater(loss, settings)
-        noise = AdditiveGaussianModule(
-            env.action_spec, sigma_init=settings.noise, sigma_end=settings.noise
-        )
-        policy = TensorDictSequential(actor, noise)
-        buffer = make_buffer(settings.behaviour_steps, settings.batch_size)
-        for data in collect(env, policy, settings.behaviour_steps, settings.exploration_steps):
-            buffer.extend(data)
-            if len(buffer) > settings.exploration_steps:
-                for _ in range(len(data)):
-                    update(buffer.sample())
-            report(len(data))
-        parts = []
-        for data in collect(env, policy, settings.batch_steps):
-            parts.append(data)
-            report(len(data))
-    batch = torch.cat(parts)
+    env, dims = make_env(settings.env)
+    env.set_seed(derive_seed(seed, "behaviour", "env"))
+    actor, spec = make_actor(*dims), env.action_spec
+    loss = TD3Loss(actor, make_critics(*dims), action_spec=spec, loss_function="l2")
+    update = make_update(loss, settings)
+    noise = AdditiveGaussianModule(spec, sigma_init=settings.noise, sigma_end=settings.noise)
+    policy = TensorDictSequential(actor, noise)
+    buffer = make_buffer(settings.behaviour_steps, settings)
+    random_steps = settings.exploration_steps
+    for data in collect(env, policy, settings.behaviour_steps, report, random_steps):
+        buffer.extend(data)
+        if len(buffer) > random_steps:
+            for _ in range(len(data) // settings.steps_per_update):
+                update(total(loss(buffer.sample())))
+    batch = torch.cat(list(collect(env, policy, settings.batch_steps, report)))
+    env.close()
     after = batch["next"]
-    returns = after["episode_reward"][after["done"]]
-    if not len(returns):
-        raise ConfigError(f"batch_steps is {settings.batch_steps}; valid: a whole episode at least")
-    state = {"batch": batch.select(*TRANSITION).to_dict(), "returns": returns}
-    save_checkpoint(path, state, {"kind": "batch", "env": settings.env, "seed": seed})
-    return make_rows("behaviour", seed, returns.tolist())
+    returns = after["episode_reward"][after["done"]].tolist()
+    if not returns:
+        raise ConfigError(f"batch_steps is {settings.batch_steps}; valid: an episode at least")
+    keep = ("observation", "reward", "done", "terminated")
+    batch = batch.select("observation", "action", *(("next", key) for key in keep))
+    save_checkpoint(batch_path(settings, seed), batch.to_dict(), {"kind": "batch"})
+    return returns
 
 
-def train_job(job: tuple[Settings, str, int], report: Report) -> list[Row]:
+def train(settings: Settings, name: str, seed: int, report: Report) -> list[float]:
     """Trains an algorithm on a seed's batch alone; the returns of its policy's episodes."""
-    settings, name, seed = job
-    path = Path(settings.run_dir) / "results" / f"{name}-seed{seed}.csv"
-    if path.exists():
-        report(settings.updates)
-        return read_rows(path)
     state, _ = load_checkpoint(batch_path(settings, seed), kind="batch")
-    batch = TensorDict(state["batch"], batch_size=[settings.batch_steps])
+    batch = TensorDict(state, batch_size=[len(state["action"])])
     loc, scale = batch["observation"].mean(0), batch["observation"].std(0).clamp_min(1e-3)
     for part in (batch, batch["next"]):
         part["observation"] = (part["observation"] - loc) / scale
-    buffer = make_buffer(settings.batch_steps, settings.batch_size)
+    buffer = make_buffer(len(batch), settings)
     buffer.extend(batch)
 
     torch.manual_seed(derive_seed(seed, name))
-    norm = ObservationNorm(loc, scale, in_keys=["observation"], standard_normal=True)
-    with closing(make_env(settings.env).append_transform(norm)) as env:
-        loss, make_policy = ALGORITHMS[name](*dimensions(env))
-        update = make_updater(loss, settings)
-        warmup = WARMUP.get(name, 0.0) * settings.updates
-        for i in range(settings.updates):
-            value = update(buffer.sample(), generator_only=i < warmup)
-            if i % 100 == 0:
-                check_finite({"loss": value}, f"{name}, seed {seed}, update {i}")
-                report(min(100, settings.updates - i))
-        policy = make_policy()
+    env, dims = make_env(settings.env)
+    env = env.append_transform(ObservationNorm(loc, scale, ["observation"], standard_normal=True))
+    loss, make_policy = ALGORITHMS[name](*dims)
+    update = make_update(loss, settings)
+    warmup = int(WARMUP.get(name, 0.0) * settings.updates)
+    for i in range(settings.updates):
+        if i < warmup:
+            value, _ = loss.generator_loss(buffer.sample())
+        else:
+            losses = loss(buffer.sample())
+            value = total(losses.exclude("loss_generator") if warmup else losses)
+        update(value)
+        report(1)
+        if i % 100 == 0:
+            check_finite({"loss": value.detach()}, f"{name}, seed {seed}, update {i}")
+    policy, returns = make_policy(), []
+    for i in range(settings.eval_episodes):
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            returns = [
-                rollout_episode(env, policy, seed=derive_seed(seed, "evaluate", i), max_steps=1000)[
-                    "next", "reward"
-                ]
-                .sum()
-                .item()
-                for i in range(settings.eval_episodes)
-            ]
-    rows = make_rows(name, seed, returns)
-    write_rows(path, rows)
-    return rows
-
-
-def read_rows(path: Path) -> list[Row]:
-    """What an earlier command left."""
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+            start = derive_seed(seed, "evaluate", i)
+            episode = rollout_episode(env, policy, seed=start, max_steps=1000)
+        returns.append(episode["next", "reward"].sum().item())
+    env.close()
+    return returns
 
 
 def batch_path(settings: Settings, seed: int) -> Path:
@@ -330,15 +288,33 @@ def batch_path(settings: Settings, seed: int) -> Path:
     return Path(settings.run_dir) / "batches" / f"seed{seed}.safetensors"
 
 
-def make_rows(algorithm: str, seed: int, returns: Sequence[float]) -> list[Row]:
-    """One row of ``results.csv`` per episode."""
-    return [
-        {"algorithm": algorithm, "seed": seed, "episode": i, "return": value}
+def job_size(settings: Settings, name: str) -> int:
+    """Steps of a behaviour, updates of an algorithm."""
+    behaviour = name == BEHAVIOUR
+    return settings.behaviour_steps + settings.batch_steps if behaviour else settings.updates
+
+
+def run_job(job: tuple[Settings, str, int], report: Report) -> list[Row]:
+    """Rows of an algorithm (or of the behaviour) and a seed; kept when done, read back if there."""
+    settings, name, seed = job
+    path = Path(settings.run_dir) / "results" / f"{name}-seed{seed}.csv"
+    if path.exists():
+        report(job_size(settings, name))
+        with path.open(newline="") as file:
+            return list(csv.DictReader(file))
+    if name == BEHAVIOUR:
+        returns = make_batch(settings, seed, report)
+    else:
+        returns = train(settings, name, seed, report)
+    rows = [
+        {"algorithm": name, "seed": seed, "episode": i, "return": round(value, 3)}
         for i, value in enumerate(returns)
     ]
+    write_rows(path, rows)
+    return rows
 
 
-def make_table(rows: Sequence[Row]) -> str:
+def make_table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Mean return per algorithm and seed, over seeds, and against the behaviour's, in Markdown.
 
     The deviation is that of the seeds' means; the last column is the mean over the seeds of what
@@ -352,39 +328,34 @@ def make_table(rows: Sequence[Row]) -> str:
         name: {seed: statistics.fmean(values) for seed, values in seeds.items()}
         for name, seeds in returns.items()
     }
-    seeds = sorted(means["behaviour"])
+    seeds = sorted(means[BEHAVIOUR])
     header = ["Algorithm", *(f"Seed {seed}" for seed in seeds), "Mean ± std", "Of behaviour"]
     lines = [header, ["---", *["---:"] * (len(header) - 1)]]
     for name, mean in means.items():
         values = [mean[seed] for seed in seeds]
-        share = statistics.fmean(mean[seed] / means["behaviour"][seed] for seed in seeds)
         total = f"{statistics.fmean(values):.0f} ± {statistics.pstdev(values):.0f}"
-        lines.append([name, *(f"{value:.0f}" for value in values), total, f"{share:.0%}"])
+        share = "–"  # of a return that is not positive, a share says nothing
+        if min(means[BEHAVIOUR].values()) > 0:
+            share = f"{statistics.fmean(mean[i] / means[BEHAVIOUR][i] for i in seeds):.0%}"
+        lines.append([name, *(f"{value:.0f}" for value in values), total, share])
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def extrapolation(settings: Settings) -> None:
-    """Runs everything that is not done yet, then writes ``results.csv`` and ``table.md``."""
+    """Runs what is not done yet, then writes ``results.csv`` and ``table.md``."""
     started, run_dir = time.monotonic(), Path(settings.run_dir)
-    count = len(settings.seeds)
-    behaviour = run_jobs(
-        batch_job,
-        [(settings, seed) for seed in settings.seeds],
-        workers=settings.workers,
-        total=(settings.behaviour_steps + settings.batch_steps) * count,
-        description="behaviour",
-        unit="step",
-    )
-    jobs = [(settings, name, seed) for name in settings.algorithms for seed in settings.seeds]
-    trained = run_jobs(
-        train_job,
-        jobs,
-        workers=settings.workers,
-        total=settings.updates * len(jobs),
-        description="offline",
-        unit="update",
-    )
-    rows = [row for part in [*behaviour, *trained] for row in part]
+    parts = []
+    for names, unit in ([BEHAVIOUR], "step"), (settings.algorithms, "update"):
+        jobs = [(settings, name, seed) for name in names for seed in settings.seeds]
+        parts += run_jobs(
+            run_job,
+            jobs,
+            workers=settings.workers,
+            total=sum(job_size(settings, name) for _, name, _ in jobs),
+            description=f"extrapolation: {unit}s",
+            unit=unit,
+        )
+    rows = [row for part in parts for row in part]
     write_rows(run_dir / "results.csv", rows)
     write_atomic(run_dir / "table.md", make_table(rows))
     print(make_table(rows))
@@ -407,6 +378,10 @@ def check_settings(settings: Settings) -> None:
     ]
     if settings.env not in envs:
         raise UnknownNameError("env", settings.env, envs)
+    try:
+        importlib.import_module("gymnasium.envs.mujoco")
+    except ImportError as error:  # imageio, which gymnasium itself does not require
+        raise ConfigError(f"env {settings.env} needs one more package: {error.name}") from error
     for name in settings.algorithms:
         if name not in ALGORITHMS:
             raise UnknownNameError("algorithm", name, ALGORITHMS)
