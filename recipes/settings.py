@@ -14,6 +14,7 @@ from torchrl_bmrl.agents import LATENT_SOURCES
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.experts.controllers import ExpertGains
 from torchrl_bmrl.names import TASKS, check_task
+from torchrl_bmrl.objectives.checks import check_value_bounds
 from torchrl_bmrl.objectives.common import LOSS_FUNCTIONS
 from torchrl_bmrl.objectives.distillation import CONTEXTS, ENCODER_TERMS
 from torchrl_bmrl.objectives.generative import KL_REDUCTIONS
@@ -117,10 +118,13 @@ POSITIVE = (
     "bcq.eval_episodes",
     "bcq.batch_size",
     "bcq.lr",
+    "bcq.num_qvalue_nets",
+    "bcq.num_candidates",
     "distill.updates",
     "distill.batch_size",
     "distill.lr",
     "distill.task_latent_dim",
+    "distill.context_size",
     "evaluate.episodes",
     "evaluate.num_candidates",
 )
@@ -159,6 +163,19 @@ def check_settings(config: Config) -> None:
     for key in POSITIVE:
         if (value := OmegaConf.select(settings, key)) <= 0:
             raise ConfigError(f"{key} is {value}; valid: above 0")
+    for key in ("bcq.lmbda", "bcq.gamma", "distill.context_fraction"):
+        if not 0 <= (value := OmegaConf.select(settings, key)) <= 1:
+            raise ConfigError(f"{key} is {value}; valid: between 0 and 1")
+    for key in ("bcq.generator_warmup", "collect.noise", "distill.metric_weight"):
+        if (value := OmegaConf.select(settings, key)) < 0:
+            raise ConfigError(f"{key} is {value}; valid: 0 or above")
+    for key in ("bcq.critic_grad_clip", "bcq.latent_clip"):
+        if (value := OmegaConf.select(settings, key)) is not None and value <= 0:
+            raise ConfigError(f"{key} is {value}; valid: above 0, or null")
+    check_value_bounds(config.bcq.value_bounds)
+    for term in config.distill.encoder_terms:
+        if term not in ENCODER_TERMS:
+            raise UnknownNameError("encoder term", term, ENCODER_TERMS)
     if config.collect.valid_episodes < 1 or min(config.collect.train_episodes.values()) < 1:
         raise ConfigError("collect.train_episodes and collect.valid_episodes; valid: at least 1")
 

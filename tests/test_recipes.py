@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 pytest.importorskip("hydra")
 pytest.importorskip("gymnasium")
@@ -128,6 +129,13 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
         ("distill.context=next", "distill.context 'next'; .*current, previous, random, set"),
         ("distill.prototype=mode", "distill.prototype 'mode'; .*mean, medoid"),
         ("bcq.loss_function=l3", "bcq.loss_function 'l3'; .*l2, l1, smooth_l1"),
+        ("bcq.kl_reduction=max", "bcq.kl_reduction 'max'; .*mean, sum"),
+        ("bcq.lmbda=1.5", "bcq.lmbda is 1.5; valid: between 0 and 1"),
+        ("bcq.generator_warmup=-1", "bcq.generator_warmup is -1; valid: 0 or above"),
+        ("bcq.critic_grad_clip=0", "bcq.critic_grad_clip is 0.0; valid: above 0, or null"),
+        ("bcq.value_bounds=[1,0]", r"value_bounds are .1.0, 0.0.; valid: .*low < high"),
+        ("distill.encoder_terms=[critic]", "unknown encoder term 'critic'; .*qvalue, metric"),
+        ("distill.metric_weight=-1", "distill.metric_weight is -1.0; valid: 0 or above"),
         ("workers=0", "workers is 0"),
         ("bcq.lr=0", "bcq.lr is 0"),
         ("bcq.eval_episodes=0", "bcq.eval_episodes is 0"),
@@ -374,6 +382,57 @@ def test_stage_1_resumed_equals_never_stopped(
     expected = contents(finished, "bcq/lift/*")
     assert len(expected) == 2
     assert contents(tmp_path, "bcq/lift/*") == expected
+
+
+def trained(
+    finished: Path, folder: Path, *overrides: str
+) -> tuple[dict[str, Any], float, set[str]]:
+    """What stage 1 trains of lift: its state, the critics' way from their start, what it logs."""
+    import train_bcq
+
+    from torchrl_bmrl.agents import make_bcq_loss
+    from torchrl_bmrl.checkpoint import load_checkpoint
+    from torchrl_bmrl.parallel import derive_seed
+
+    shutil.copytree(finished / "data", folder / "data")
+    config = OmegaConf.to_object(configured(*SMALL, f"run_dir={folder}", *overrides))
+    train_bcq.train_task((config, "lift"), lambda count: None)
+    path = folder / "bcq" / "lift" / "checkpoint.safetensors"
+    state, metadata = load_checkpoint(path, kind="bcq")
+    torch.manual_seed(derive_seed(config.seed, "bcq", "lift"))
+    start = make_bcq_loss(**metadata["loss"]).state_dict()
+    way = max(
+        float((state["loss"][key] - start[key]).abs().max())
+        for key in start
+        if key.startswith("qvalue_network_params") and key in state["loss"]
+    )
+    return state, way, {path.stem for path in (folder / "logs").rglob("bcq_lift/**/*.csv")}
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_critics_wait_while_the_generator_warms_up(
+    run: Run, finished: Path, tmp_path: Path
+) -> None:
+    for warmup, waits in ((12, True), (11, False)):
+        folder = tmp_path / str(warmup)
+        _, way, logged = trained(finished, folder, f"bcq.generator_warmup={warmup}")
+        assert (way == 0) == waits
+        assert "loss_generator" in logged
+        assert ("loss_qvalue" in logged) != waits
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_the_critics_gradient_is_clipped_and_no_other(
+    run: Run, finished: Path, tmp_path: Path
+) -> None:
+    # Adam divides by the gradient's size but for its epsilon of 1e-8: only a tiny norm shows.
+    state, way, _ = trained(finished, tmp_path / "clipped", "bcq.critic_grad_clip=1e-12")
+    whole, whole_way, _ = trained(finished, tmp_path / "whole")
+    assert way < 1e-4 < whole_way
+    generator = [key for key in state["loss"] if key.startswith("generator_params")]
+    assert all(torch.equal(state["loss"][key], whole["loss"][key]) for key in generator)
 
 
 @pytest.mark.robosuite

@@ -52,7 +52,7 @@ class MetaDistillationLoss(LossModule):
 
     The teachers are frozen: row i of the data is task i. Any decoder and critic will do, those of
     :class:`~torchrl_bmrl.objectives.BCQLoss` and :class:`~torchrl_bmrl.objectives.PLASLoss` alike;
-    equally shaped ones run as one batched ensemble.
+    equally shaped ones run as one batched ensemble. A perturbation network is not distilled.
 
     Args:
         task_encoder: M, (observation, action, next reward, next observation) → ``task_latent``.
