@@ -96,13 +96,16 @@ def test_decoded_actions_fill_the_bounds_and_never_leave_them(bounds: tuple[floa
     assert decoder(data)["action"].unique().item() == sum(bounds) / 2
 
 
-def test_generator_proposes_a_fresh_action_for_every_row_unless_the_latent_is_given() -> None:
+def test_generator_proposes_a_fresh_action_for_every_row_and_call() -> None:
     generator = ActionVAE(*DIMS, num_cells=CELLS)
     same = TensorDict({"observation": torch.zeros(5, OBSERVATION_DIM)}, [5])
     proposed = generator(same.clone())
     assert len(proposed["action"].unique(dim=0)) == 5
-    given = same.clone().set("action_latent", proposed["action_latent"].clone())
-    assert torch.equal(generator(given)["action"], proposed["action"])
+    # In a rollout the last step's latent comes along; it must not be acted with again.
+    before = proposed["action_latent"].clone()
+    again = generator(proposed.clone())
+    assert (again["action_latent"] != before).all()
+    assert torch.equal(generator.decoder(again.clone())["action"], again["action"])
 
 
 @pytest.mark.parametrize("task_latent_dim", [0, 2])

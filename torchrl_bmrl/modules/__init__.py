@@ -7,7 +7,13 @@ from torchrl_bmrl.modules.generator import (
     make_perturbation_network,
     make_qvalue_network,
 )
-from torchrl_bmrl.modules.policy import BCQPolicy, DiscreteBCQPolicy, PLASPolicy
+from torchrl_bmrl.modules.policy import (
+    BCQPolicy,
+    DiscreteBCQPolicy,
+    PLASPolicy,
+    extract_critic,
+    extract_network,
+)
 from torchrl_bmrl.modules.task_latent import (
     DemonstrationTaskLatent,
     OnlineTaskLatent,
@@ -25,6 +31,8 @@ __all__ = [
     "OnlineTaskLatent",
     "PLASPolicy",
     "PrototypeTaskLatent",
+    "extract_critic",
+    "extract_network",
     "make_decoder",
     "make_latent_actor",
     "make_perturbation_network",

@@ -51,12 +51,13 @@ class _BoundedDecoder(nn.Module):
         in_features: int,
         action_dim: int,
         num_cells: Sequence[int],
-        bounds: tuple[float, float],
+        bounds: tuple[float | Tensor, float | Tensor],
     ) -> None:
         super().__init__()
         self.network = make_mlp(in_features, action_dim, num_cells)
-        self.register_buffer("low", torch.tensor(float(bounds[0])))
-        self.register_buffer("high", torch.tensor(float(bounds[1])))
+        low, high = (torch.as_tensor(x, dtype=torch.get_default_dtype()) for x in bounds)
+        self.register_buffer("low", low)
+        self.register_buffer("high", high)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         unit = 0.5 * (self.network(*inputs).tanh() + 1.0)
@@ -76,13 +77,13 @@ class ActionVAE(TensorDictModuleBase):
     Keyword Args:
         latent_dim: size of z. Default ``2 * action_dim``.
         num_cells: widths of the hidden layers of both networks.
-        bounds: lower and upper bound of every action dimension.
+        bounds: lower and upper bound of the action, numbers or ``(action_dim,)``.
         observation_key: key of the observation.
 
     ``encoder`` reads ``observation (*B, observation_dim)`` and ``action (*B, action_dim)`` and
     writes ``action_latent_loc`` and ``action_latent_scale``, ``(*B, latent_dim)``. ``decoder``
     reads ``observation`` and ``action_latent`` and writes ``action``.
-    :meth:`forward` proposes actions: it draws z ~ N(0, I) where the input has none, and decodes.
+    :meth:`forward` proposes actions: it draws z ~ N(0, I) anew at every call, and decodes.
 
     Example:
         >>> from tensordict import TensorDict
@@ -99,11 +100,11 @@ class ActionVAE(TensorDictModuleBase):
         *,
         latent_dim: int | None = None,
         num_cells: Sequence[int] = (256, 256),
-        bounds: tuple[float, float] = (-1.0, 1.0),
+        bounds: tuple[float | Tensor, float | Tensor] = (-1.0, 1.0),
         observation_key: NestedKey = "observation",
     ) -> None:
         super().__init__()
-        self.latent_dim = latent_dim or 2 * action_dim
+        self.latent_dim = 2 * action_dim if latent_dim is None else latent_dim
         self.encoder = TensorDictModule(
             _Posterior(observation_dim + action_dim, self.latent_dim, num_cells),
             in_keys=[observation_key, "action"],
@@ -122,12 +123,10 @@ class ActionVAE(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Proposes one action per row."""
-        if tensordict.get("action_latent", None) is None:
-            observation = tensordict.get(self.in_keys[0])
-            shape = (*tensordict.batch_size, self.latent_dim)
-            latent = torch.randn(shape, device=observation.device, dtype=observation.dtype)
-            tensordict.set("action_latent", latent)
-        return self.decoder(tensordict)
+        weight = next(self.parameters())
+        shape = (*tensordict.batch_size, self.latent_dim)
+        latent = torch.randn(shape, device=weight.device, dtype=weight.dtype)
+        return self.decoder(tensordict.set("action_latent", latent))
 
 
 def make_decoder(
@@ -137,7 +136,7 @@ def make_decoder(
     *,
     task_latent_dim: int = 0,
     num_cells: Sequence[int] = (256, 256),
-    bounds: tuple[float, float] = (-1.0, 1.0),
+    bounds: tuple[float | Tensor, float | Tensor] = (-1.0, 1.0),
     in_keys: Sequence[NestedKey] | None = None,
 ) -> TensorDictModule:
     """Decoder from observation, ``action_latent`` and, with ``task_latent_dim``, ``task_latent``.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any
 
@@ -42,10 +43,14 @@ class BCQPolicy(TensorDictModuleBase):
         latent_clip: bound on the latent, ``None`` for none. Default 0.5.
         max_perturbation: φ.
         bounds: of the action, used with a perturbation network.
-        action_latent_key: what the decoder calls z.
+        action_key, action_latent_key, perturbation_key, state_action_value_key: what the networks
+            call them.
 
-    Keys read: ``observation (*B, obs_dim)`` (and ``task_latent (*B, m)``). Key written:
-    ``action (*B, action_dim)``, or what the decoder calls it.
+    Keys read: what the networks read beside what they write, such as ``observation (*B, obs_dim)``
+    and ``task_latent (*B, m)``. Key written: ``action (*B, action_dim)``.
+
+    Raises:
+        BMRLError: for candidates below one.
 
     Example:
         >>> from tensordict import TensorDict
@@ -70,7 +75,10 @@ class BCQPolicy(TensorDictModuleBase):
         latent_clip: float | None = 0.5,
         max_perturbation: float = 0.05,
         bounds: tuple[float | Tensor, float | Tensor] = (-1.0, 1.0),
+        action_key: NestedKey = "action",
         action_latent_key: NestedKey = "action_latent",
+        perturbation_key: NestedKey = "perturbation",
+        state_action_value_key: NestedKey = "state_action_value",
     ) -> None:
         super().__init__()
         if num_candidates < 1:
@@ -86,8 +94,11 @@ class BCQPolicy(TensorDictModuleBase):
         self.register_buffer("action_low", low)
         self.register_buffer("action_high", high)
         self.action_latent_key = action_latent_key
-        self.in_keys = [key for key in decoder.in_keys if key != action_latent_key]
-        self.out_keys = [decoder.out_keys[-1]]
+        self.perturbation_key = perturbation_key
+        self.state_action_value_key = state_action_value_key
+        networks = (decoder, qvalue_network, perturbation_network)
+        self.in_keys = _state_keys(networks, (action_key, action_latent_key))
+        self.out_keys = [action_key]
 
     @classmethod
     def from_loss(cls, loss: LossModule, *, num_candidates: int = 100) -> BCQPolicy:
@@ -95,17 +106,17 @@ class BCQPolicy(TensorDictModuleBase):
 
         Later updates of the loss do not reach the policy.
         """
-        generator = _network(loss, "generator")
+        generator = extract_network(loss, "generator")
         return cls(
             generator.decoder,
-            _instantiate(*loss.critic(0)),
-            _network(loss, "perturbation_network"),
+            extract_critic(loss),
+            extract_network(loss, "perturbation_network"),
             latent_dim=generator.latent_dim,
             num_candidates=num_candidates,
             latent_clip=None if loss.latent_clip is None else float(loss.latent_clip),
             max_perturbation=float(loss.max_perturbation),
             bounds=(loss.action_low, loss.action_high),
-            action_latent_key=loss.tensor_keys.action_latent,
+            **_keys(loss, "action", "action_latent", "perturbation", "state_action_value"),
         )
 
     @torch.no_grad()
@@ -113,16 +124,16 @@ class BCQPolicy(TensorDictModuleBase):
         """Writes the action."""
         proposals = tensordict.select(*self.in_keys).unsqueeze(-1)
         proposals = proposals.expand(*tensordict.batch_size, self.num_candidates)
-        observation = proposals.get(self.in_keys[0])
+        weight = next(self.decoder.parameters())
         latent = sample_action_latent(
             (*proposals.batch_size, self.latent_dim),
             latent_clip=self.latent_clip,
-            device=observation.device,
-            dtype=observation.dtype,
+            device=weight.device,
+            dtype=weight.dtype,
         )
         proposals = self.decoder(proposals.copy().set(self.action_latent_key, latent))
         proposals = _perturb(self, proposals)
-        value = self.qvalue_network(proposals).get(self.qvalue_network.out_keys[-1])
+        value = self.qvalue_network(proposals).get(self.state_action_value_key)
         best = value.argmax(dim=-2, keepdim=True)
         action = proposals.get(self.out_keys[0])
         best = best.expand(*best.shape[:-1], action.shape[-1])
@@ -144,8 +155,10 @@ class PLASPolicy(TensorDictModuleBase):
     Keyword Args:
         max_perturbation: φ.
         bounds: of the action, used with a perturbation network.
+        action_key, action_latent_key, perturbation_key: what the networks call them.
 
-    Keys read: ``observation (*B, obs_dim)``. Key written: ``action (*B, action_dim)``.
+    Keys read: what the networks read beside what they write, such as ``observation (*B, obs_dim)``.
+    Key written: ``action (*B, action_dim)``.
 
     Example:
         >>> from tensordict import TensorDict
@@ -166,6 +179,9 @@ class PLASPolicy(TensorDictModuleBase):
         *,
         max_perturbation: float = 0.05,
         bounds: tuple[float | Tensor, float | Tensor] = (-1.0, 1.0),
+        action_key: NestedKey = "action",
+        action_latent_key: NestedKey = "action_latent",
+        perturbation_key: NestedKey = "perturbation",
     ) -> None:
         super().__init__()
         self.actor_network = actor_network
@@ -175,14 +191,17 @@ class PLASPolicy(TensorDictModuleBase):
         low, high = (torch.as_tensor(bound) for bound in bounds)
         self.register_buffer("action_low", low)
         self.register_buffer("action_high", high)
-        self.in_keys = list(actor_network.in_keys)
-        self.out_keys = [decoder.out_keys[-1]]
+        self.perturbation_key = perturbation_key
+        networks = (actor_network, decoder, perturbation_network)
+        self.in_keys = _state_keys(networks, (action_key, action_latent_key))
+        self.out_keys = [action_key]
 
     @classmethod
     def from_loss(cls, loss: LossModule) -> PLASPolicy:
         """Policy of a trained :class:`~torchrl_bmrl.objectives.PLASLoss`, as a copy."""
         generator, actor, perturbation = (
-            _network(loss, name) for name in ("generator", "actor_network", "perturbation_network")
+            extract_network(loss, name)
+            for name in ("generator", "actor_network", "perturbation_network")
         )
         return cls(
             actor,
@@ -190,6 +209,7 @@ class PLASPolicy(TensorDictModuleBase):
             perturbation,
             max_perturbation=float(loss.max_perturbation),
             bounds=(loss.action_low, loss.action_high),
+            **_keys(loss, "action", "action_latent", "perturbation"),
         )
 
     @torch.no_grad()
@@ -213,7 +233,7 @@ class DiscreteBCQPolicy(TensorDictModuleBase):
     Keyword Args:
         threshold: τ. Default 0.3.
         action_space: ``"one-hot"``, written as ``(*B, n)``, or ``"categorical"``, ``(*B,)``.
-        action_key: what the action is called.
+        action_key, logits_key, action_value_key: what the networks call them.
 
     Keys read: ``observation``. Key written: ``action``, int64.
 
@@ -237,8 +257,12 @@ class DiscreteBCQPolicy(TensorDictModuleBase):
         threshold: float = 0.3,
         action_space: str = "one-hot",
         action_key: NestedKey = "action",
+        logits_key: NestedKey = "logits",
+        action_value_key: NestedKey = "action_value",
     ) -> None:
         super().__init__()
+        self.logits_key = logits_key
+        self.action_value_key = action_value_key
         self.generator = generator
         self.qvalue_network = qvalue_network
         self.threshold = threshold
@@ -250,19 +274,19 @@ class DiscreteBCQPolicy(TensorDictModuleBase):
     def from_loss(cls, loss: LossModule) -> DiscreteBCQPolicy:
         """Policy of a trained :class:`~torchrl_bmrl.objectives.DiscreteBCQLoss`, as a copy."""
         return cls(
-            _network(loss, "generator"),
-            _instantiate(*loss.critic(0)),
+            extract_network(loss, "generator"),
+            extract_critic(loss),
             threshold=float(loss.threshold),
             action_space=loss.action_space,
-            action_key=loss.tensor_keys.action,
+            **_keys(loss, "action", "logits", "action_value"),
         )
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes ``action``."""
         data = self.qvalue_network(self.generator(tensordict.select(*self.in_keys)))
-        allowed = likely_actions(data.get(self.generator.out_keys[-1]), self.threshold)
-        value = data.get(self.qvalue_network.out_keys[-1]).masked_fill(~allowed, -torch.inf)
+        allowed = likely_actions(data.get(self.logits_key), self.threshold)
+        value = data.get(self.action_value_key).masked_fill(~allowed, -torch.inf)
         action = value.argmax(-1)
         if self.action_space == "one-hot":
             action = one_hot(action, value.shape[-1])
@@ -275,15 +299,51 @@ def _perturb(policy: BCQPolicy | PLASPolicy, data: TensorDictBase) -> TensorDict
     if network is None:
         return data
     data = network(data)
-    action, perturbation = data.get(key), data.get(network.out_keys[-1])
+    action, perturbation = data.get(key), data.get(policy.perturbation_key)
     low, high = policy.action_low, policy.action_high
     return data.set(key, perturbed_action(action, perturbation, policy.max_perturbation, low, high))
 
 
-def _network(loss: LossModule, name: str) -> Any:
-    """A stand-alone copy of one of a loss's networks; ``None`` for one that it does not have."""
+def _state_keys(networks: Iterable[TensorDictModule | None], made: Iterable[Any]) -> list[Any]:
+    """What networks read beside what they make for each other."""
+    keys = [key for network in networks if network is not None for key in network.in_keys]
+    return [key for key in dict.fromkeys(keys) if key not in set(made)]
+
+
+def _keys(loss: LossModule, *names: str) -> dict[str, NestedKey]:
+    """Arguments that carry a loss's names of keys over to its policy."""
+    return {f"{name}_key": getattr(loss.tensor_keys, name) for name in names}
+
+
+def extract_network(loss: LossModule, name: str) -> Any:
+    """A stand-alone, frozen copy of one of a loss's networks; ``None`` for one it does not have.
+
+    Args:
+        loss: such as :class:`~torchrl_bmrl.objectives.PLASLoss`.
+        name: such as ``"generator"``; for a critic see :func:`extract_critic`.
+
+    Example:
+        >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
+        >>> from torchrl_bmrl.objectives import BCQLoss
+        >>> loss = BCQLoss(ActionVAE(3, 2), make_qvalue_network(3, 2), bounds=(-1.0, 1.0))
+        >>> extract_network(loss, "generator").decoder.out_keys
+        ['action']
+    """
     module = getattr(loss, name)
     return None if module is None else _instantiate(module, getattr(loss, f"{name}_params"))
+
+
+def extract_critic(loss: LossModule, index: int = 0) -> TensorDictModule:
+    """A stand-alone, frozen copy of one of a loss's critics.
+
+    Example:
+        >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
+        >>> from torchrl_bmrl.objectives import BCQLoss
+        >>> loss = BCQLoss(ActionVAE(3, 2), make_qvalue_network(3, 2), bounds=(-1.0, 1.0))
+        >>> extract_critic(loss, 1).out_keys
+        ['state_action_value']
+    """
+    return _instantiate(*loss.critic(index))
 
 
 def _instantiate(module: TensorDictModule, params: TensorDictBase) -> TensorDictModule:

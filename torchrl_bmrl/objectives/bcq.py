@@ -10,7 +10,7 @@ from torchrl.data.tensor_specs import TensorSpec
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.functional import bcq_next_value
-from torchrl_bmrl.objectives.checks import check_lmbda, check_value_bounds
+from torchrl_bmrl.objectives.checks import check_number, check_value_bounds
 from torchrl_bmrl.objectives.generative import GenerativeLoss
 
 
@@ -140,11 +140,12 @@ class BCQLoss(GenerativeLoss):
             deactivate_vmap=deactivate_vmap,
             use_prioritized_weights=use_prioritized_weights,
         )
-        if num_candidates < 1:
-            raise BMRLError(f"num_candidates is {num_candidates}; valid: at least 1")
-        self.num_candidates = num_candidates
+        self.num_candidates = check_number("num_candidates", num_candidates, 1, integer=True)
         self.value_bounds = check_value_bounds(value_bounds)
-        self.register_coefficients(lmbda=check_lmbda(lmbda), latent_clip=latent_clip)
+        self.register_coefficients(
+            lmbda=check_number("lmbda", lmbda, 0, 1),
+            latent_clip=check_number("latent_clip", latent_clip, optional=True),
+        )
         self.convert_critics(qvalue_network, num_qvalue_nets)
         self.finish()
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from math import isfinite
+from math import inf, isfinite
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import LossModule
@@ -14,15 +15,42 @@ from torchrl.objectives import LossModule
 from torchrl_bmrl.errors import BMRLError
 
 
-def check_lmbda(lmbda: float) -> float:
-    """λ of the soft clipped double-Q.
+def check_number(
+    name: str,
+    value: Any,
+    low: float = 0.0,
+    high: float = inf,
+    *,
+    integer: bool = False,
+    optional: bool = False,
+) -> Any:
+    """An option that is a number.
+
+    Args:
+        name: the option, for the message.
+        value: what was given.
+        low: smallest valid value.
+        high: largest valid value.
+        integer: whether it must be an integer.
+        optional: whether ``None`` is valid.
 
     Raises:
-        BMRLError: outside [0, 1].
+        BMRLError: for anything else.
+
+    Example:
+        >>> check_number("lmbda", 0.75, 0.0, 1.0)
+        0.75
     """
-    if not 0.0 <= lmbda <= 1.0:
-        raise BMRLError(f"lmbda is {lmbda}; valid: between 0 and 1")
-    return lmbda
+    if value is None and optional:
+        return value
+    kind = (int,) if integer else (int, float)
+    number = isinstance(value, kind) and not isinstance(value, bool)
+    if not number or not low <= value <= high:
+        span = f"between {low:g} and {high:g}" if high < inf else f"at least {low:g}"
+        raise BMRLError(
+            f"{name} is {value!r}; valid: {span}{', an integer' * integer}{', or None' * optional}"
+        )
+    return value
 
 
 def check_value_bounds(bounds: tuple[float, float] | None) -> tuple[float, float] | None:
@@ -31,9 +59,39 @@ def check_value_bounds(bounds: tuple[float, float] | None) -> tuple[float, float
     Raises:
         BMRLError: if the lower one is not below the upper one.
     """
-    if bounds is not None and not bounds[0] < bounds[1]:
+    if bounds is None:
+        return None
+    if not isinstance(bounds, (list, tuple)) or len(bounds) != 2 or not bounds[0] < bounds[1]:
         raise BMRLError(f"value_bounds are {bounds}; valid: (low, high) with low < high, or None")
-    return bounds
+    return bounds[0], bounds[1]
+
+
+def check_network(name: str, network: Any) -> None:
+    """A network with keys.
+
+    Raises:
+        BMRLError: for anything but a TensorDictModule.
+    """
+    if not isinstance(network, TensorDictModuleBase):
+        raise BMRLError(
+            f"{name} is a {type(network).__name__}; valid: a TensorDictModule, which knows the "
+            "keys that it reads and writes"
+        )
+
+
+def output(tensordict: TensorDictBase, key: NestedKey, network: TensorDictModule) -> Tensor:
+    """What a network wrote.
+
+    Raises:
+        BMRLError: if it writes other keys.
+    """
+    value = tensordict.get(key, None)
+    if value is None:
+        raise BMRLError(
+            f"a network writes {list(network.out_keys)}, not {key!r}; valid: a network that writes "
+            f"it, or another name for it in set_keys()"
+        )
+    return value
 
 
 def check_same_shape(key: NestedKey, value: Tensor, expected: Tensor) -> None:
@@ -115,8 +173,13 @@ def read(module: TensorDictModule, tensordict: TensorDictBase) -> TensorDictBase
         return module(tensordict)
     except torch.OutOfMemoryError:
         raise
-    except RuntimeError as error:
-        shapes = ", ".join(f"{key!r} {tuple(tensordict[key].shape)}" for key in module.in_keys)
+    except (RuntimeError, KeyError) as error:
+        entries = ((key, tensordict.get(key, None)) for key in module.in_keys)
+        seen = ", ".join(
+            f"{key!r} {'missing' if x is None else f'{tuple(x.shape)} {x.dtype}'}"
+            for key, x in entries
+        )
         raise BMRLError(
-            f"a network cannot read {shapes} ({error}); valid: the sizes that it was made for"
+            f"a network cannot read {seen} ({error}); valid: the sizes and types that it was "
+            "made for"
         ) from error

@@ -23,7 +23,17 @@ from torchrl.objectives.utils import (
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.objectives.checks import entry, missing, next_key, priority_weight
+from torchrl_bmrl.objectives.checks import (
+    check_network,
+    check_number,
+    entry,
+    missing,
+    next_key,
+    output,
+    priority_weight,
+    read,
+)
+from torchrl_bmrl.objectives.ensemble import kind
 from torchrl_bmrl.objectives.swap import holding, leaves, without_gradient
 
 LOSS_FUNCTIONS = ("l2", "l1", "smooth_l1")
@@ -104,7 +114,7 @@ class OfflineLoss(LossModule):
             raise UnknownNameError("reduction", reduction, REDUCTIONS)
         self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[str] | None = None
-        self.gamma = gamma
+        self.gamma = check_number("gamma", gamma, 0, 1)
         self.loss_function = loss_function
         self.separate_losses = separate_losses
         self.reduction = reduction
@@ -138,7 +148,7 @@ class OfflineLoss(LossModule):
             BMRLError: for no critics, a number that is not the list's length, or a single critic
                 that cannot be initialised anew.
         """
-        if isinstance(qvalue_network, (list, tuple)):
+        if isinstance(qvalue_network, (list, tuple, nn.ModuleList)):
             critics = list(qvalue_network)
             if not critics or num_qvalue_nets not in (None, len(critics)):
                 raise BMRLError(
@@ -146,18 +156,25 @@ class OfflineLoss(LossModule):
                     f"{num_qvalue_nets}; valid: at least one critic, and their number or None"
                 )
         else:
+            check_network("qvalue_network", qvalue_network)
             count = default if num_qvalue_nets is None else num_qvalue_nets
-            if count < 1:
-                raise BMRLError(f"num_qvalue_nets is {count}; valid: at least 1")
+            check_number("num_qvalue_nets", count, 1, integer=True)
             taken = list(self.parameters())
             critics = [qvalue_network, *(_renewed(qvalue_network, taken) for _ in range(count - 1))]
+        for critic in critics:
+            check_network("a critic", critic)
         self.num_qvalue_nets = len(critics)
         owners = [id(p) for critic in critics for p in critic.parameters()]
         known = {id(p) for p in self.parameters()}
-        # Stacking makes new parameters, so critics that share some with each other or with
-        # another network stay apart; of a list of one, TorchRL would make no parameters at all.
+        # Stacking makes new parameters and keeps one structure, so critics that differ, or share
+        # parameters with each other or another network, stay apart; of a list of one, TorchRL
+        # would make no parameters at all.
+        alike = len({kind(critic) for critic in critics}) == 1
         self._stacked = (
-            len(critics) > 1 and len(set(owners)) == len(owners) and known.isdisjoint(owners)
+            alike
+            and len(critics) > 1
+            and len(set(owners)) == len(owners)
+            and known.isdisjoint(owners)
         )
         if self._stacked:
             self.convert_to_functional(
@@ -236,7 +253,7 @@ class OfflineLoss(LossModule):
         """Runs a network, its ``target``, or it ``frozen``; see :meth:`weights`."""
         module = getattr(self, name)
         with holding(module, self.weights(name, target=target, frozen=frozen)):
-            return module(tensordict)
+            return read(module, tensordict)
 
     def evaluate(
         self,
@@ -250,7 +267,8 @@ class OfflineLoss(LossModule):
         network = self.qvalue_network
         inputs = tensordict.select(*network.in_keys)
         if not self._stacked:
-            return self.call("qvalue_network", inputs, target=target, frozen=frozen).get(key)
+            values = self.call("qvalue_network", inputs, target=target, frozen=frozen)
+            return output(values, key, network)
         weights = self.weights("qvalue_network", target=target, frozen=frozen)
         if isinstance(weights, list):
             each: Any = map(list, zip(*(leaf.unbind(0) for leaf in weights), strict=True))
@@ -262,13 +280,13 @@ class OfflineLoss(LossModule):
             outputs = []
             for own in each:
                 with holding(network, own):
-                    outputs.append(network(inputs.copy()).get(key))
+                    outputs.append(output(read(network, inputs.copy()), key, network))
             return torch.stack(outputs)
         # Made anew at every call: kept, it could not be pickled, and a copy of the loss would run
         # the original's network.
         run = _vmap_func(network, (None, 0), randomness=self.vmap_randomness)
         params = getattr(self, f"{'target_' if target else ''}qvalue_network_params")
-        return run(inputs, params.detach() if frozen else params).get(key)
+        return output(run(inputs, params.detach() if frozen else params), key, network)
 
     def qvalue(
         self, tensordict: TensorDictBase, *, target: bool = False, frozen: bool = False
@@ -461,7 +479,7 @@ class _Ensemble(TensorDictModuleBase):
     def __init__(self, critics: Sequence[TensorDictModule]) -> None:
         super().__init__()
         self.critics = nn.ModuleList(critics)
-        self.in_keys = critics[0].in_keys
+        self.in_keys = list(dict.fromkeys(key for critic in critics for key in critic.in_keys))
         self.out_keys = critics[0].out_keys
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -12,7 +12,14 @@ from torch import Tensor
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.functional import likely_actions
-from torchrl_bmrl.objectives.checks import entry, missing, next_key
+from torchrl_bmrl.objectives.checks import (
+    check_network,
+    check_number,
+    entry,
+    missing,
+    next_key,
+    output,
+)
 from torchrl_bmrl.objectives.common import OfflineLoss
 
 ACTION_SPACES = ("one-hot", "categorical")
@@ -133,11 +140,13 @@ class DiscreteBCQLoss(OfflineLoss):
         )
         if action_space not in ACTION_SPACES:
             raise UnknownNameError("action_space", action_space, ACTION_SPACES)
-        if not 0.0 <= threshold <= 1.0:
-            raise BMRLError(f"threshold is {threshold}; valid: between 0 and 1")
         self.action_space = action_space
+        check_network("generator", generator)
         self.convert_to_functional(generator, "generator", create_target_params=False)
-        self.register_coefficients(threshold=threshold, logits_weight=logits_weight)
+        self.register_coefficients(
+            threshold=check_number("threshold", threshold, 0, 1),
+            logits_weight=check_number("logits_weight", logits_weight),
+        )
         self.convert_critics(qvalue_network, num_qvalue_nets, default=1)
         self.finish()
 
@@ -205,7 +214,7 @@ class DiscreteBCQLoss(OfflineLoss):
     def logits(self, tensordict: TensorDictBase, *, after: bool = False) -> Tensor:
         """Logits of the generator at the state or the one ``after``, ``(*B, n)``."""
         data = self.rows(tensordict, self.generator.in_keys, after=after)
-        return self.call("generator", data).get(self.tensor_keys.logits)
+        return output(self.call("generator", data), self.tensor_keys.logits, self.generator)
 
     def qvalue(
         self, tensordict: TensorDictBase, *, target: bool = False, frozen: bool = False

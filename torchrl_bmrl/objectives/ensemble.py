@@ -39,11 +39,7 @@ class FrozenEnsemble(nn.Module):
         super().__init__()
         self.in_keys = list(dict.fromkeys(key for module in modules for key in module.in_keys))
         params = [TensorDict.from_module(module).data.clone() for module in modules]
-        shapes = [
-            {key: value.shape for key, value in each.items(True, True)} | {"": _kind(module)}
-            for each, module in zip(params, modules, strict=True)
-        ]
-        self.stacked = all(each == shapes[0] for each in shapes)
+        self.stacked = len({kind(module) for module in modules}) == 1
         if self.stacked:
             self.params = TensorDictParams(torch.stack(params), no_convert=True)
         else:
@@ -72,10 +68,11 @@ class FrozenEnsemble(nn.Module):
         return torch.stack(rows)
 
 
-def _kind(module: nn.Module) -> str:
-    """What tells modules apart beside their parameters: structure and plain attributes."""
+def kind(module: nn.Module) -> str:
+    """What tells modules apart beside their parameters: shapes, structure and plain attributes."""
+    shapes = [tuple(value.shape) for value in module.state_dict().values()]
     attributes = [
         {name: value for name, value in vars(part).items() if not name.startswith("_")}
         for part in module.modules()
     ]
-    return f"{module} {attributes}"
+    return f"{module} {shapes} {attributes}"

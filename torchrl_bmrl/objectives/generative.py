@@ -20,7 +20,14 @@ from torchrl_bmrl.functional import (
     sample_action_latent,
     squared_error,
 )
-from torchrl_bmrl.objectives.checks import check_same_shape, next_key, read
+from torchrl_bmrl.objectives.checks import (
+    check_network,
+    check_number,
+    check_same_shape,
+    next_key,
+    output,
+    read,
+)
 from torchrl_bmrl.objectives.common import OfflineLoss
 from torchrl_bmrl.objectives.swap import holding
 
@@ -109,6 +116,7 @@ class GenerativeLoss(OfflineLoss):
         if perturbation_network is None:
             self.perturbation_network = None
         else:
+            check_network("perturbation_network", perturbation_network)
             self.convert_to_functional(
                 perturbation_network, "perturbation_network", create_target_params=True
             )
@@ -116,7 +124,10 @@ class GenerativeLoss(OfflineLoss):
         low, high = action_bounds(action_spec, bounds, self.tensor_keys.action)
         self.register_buffer("action_low", low.to(reference))
         self.register_buffer("action_high", high.to(reference))
-        self.register_coefficients(kl_weight=kl_weight, max_perturbation=max_perturbation)
+        self.register_coefficients(
+            kl_weight=check_number("kl_weight", kl_weight),
+            max_perturbation=check_number("max_perturbation", max_perturbation),
+        )
 
     @property
     def observation_keys(self) -> list[NestedKey]:
@@ -141,7 +152,7 @@ class GenerativeLoss(OfflineLoss):
         """
         data = observation.copy().set(self.tensor_keys.action_latent, latent)
         with holding(self.generator, self.weights("generator", frozen=True)):
-            return self.generator.decoder(data)
+            return read(self.generator.decoder, data)
 
     def propose(
         self, observation: TensorDictBase, latent_clip: float | Tensor | None
@@ -161,7 +172,8 @@ class GenerativeLoss(OfflineLoss):
             return tensordict
         keys = self.tensor_keys
         tensordict = self.call("perturbation_network", tensordict, target=target)
-        action, perturbation = tensordict.get(keys.action), tensordict.get(keys.perturbation)
+        action = tensordict.get(keys.action)
+        perturbation = output(tensordict, keys.perturbation, self.perturbation_network)
         check_same_shape(keys.perturbation, perturbation, action)
         action = perturbed_action(
             action, perturbation, self.max_perturbation, self.action_low, self.action_high
@@ -184,9 +196,10 @@ class GenerativeLoss(OfflineLoss):
         action = data.get(keys.action)
         with holding(self.generator, self.weights("generator")):
             data = read(self.generator.encoder, data)
-            loc, scale = data.get(keys.action_latent_loc), data.get(keys.action_latent_scale)
+            loc = output(data, keys.action_latent_loc, self.generator.encoder)
+            scale = output(data, keys.action_latent_scale, self.generator.encoder)
             data.set(keys.action_latent, loc + scale * torch.randn_like(scale))
-            reconstruction = self.generator.decoder(data).get(keys.action)
+            reconstruction = read(self.generator.decoder, data).get(keys.action)
         check_same_shape(keys.action, action, reconstruction)
         error = squared_error(reconstruction, action) / action.shape[-1]
         divergence = gaussian_kl(loc, scale)
@@ -228,6 +241,11 @@ def action_bounds(
         bound if isinstance(bound, Tensor) else torch.tensor(bound, dtype=torch.float64)
         for bound in bounds
     )
-    if (low > high).any():
+    if low.ndim > 1 or high.ndim > 1:
+        raise BMRLError(
+            f"the bounds of the action have the shapes {tuple(low.shape)} and {tuple(high.shape)}; "
+            "valid: () or (action_dim,), so of several environments the spec of one"
+        )
+    if not (low <= high).all():
         raise BMRLError(f"the lower bound {low} of the action is above the upper bound {high}")
     return low, high

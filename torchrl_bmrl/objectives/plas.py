@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.data.tensor_specs import TensorSpec
 
 from torchrl_bmrl.functional import soft_clipped_value
-from torchrl_bmrl.objectives.checks import check_lmbda
+from torchrl_bmrl.objectives.checks import check_network, check_number, output
 from torchrl_bmrl.objectives.generative import GenerativeLoss
 
 
@@ -136,7 +136,8 @@ class PLASLoss(GenerativeLoss):
             deactivate_vmap=deactivate_vmap,
             use_prioritized_weights=use_prioritized_weights,
         )
-        self.register_coefficients(lmbda=check_lmbda(lmbda))
+        self.register_coefficients(lmbda=check_number("lmbda", lmbda, 0, 1))
+        check_network("actor_network", actor_network)
         self.convert_to_functional(actor_network, "actor_network", create_target_params=True)
         self.convert_critics(qvalue_network, num_qvalue_nets)
         self.finish()
@@ -158,8 +159,9 @@ class PLASLoss(GenerativeLoss):
 
     def act(self, observation: TensorDictBase, *, target: bool = False) -> TensorDictBase:
         """The observation with the policy's, or its ``target``'s, action."""
-        latent = self.call("actor_network", observation.copy(), target=target)
-        decoded = self.decode(observation, latent.get(self.tensor_keys.action_latent))
+        acted = self.call("actor_network", observation.copy(), target=target)
+        latent = output(acted, self.tensor_keys.action_latent, self.actor_network)
+        decoded = self.decode(observation, latent)
         return self.perturb(decoded, target=target)
 
     def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
