@@ -23,11 +23,13 @@ from helpers import (
     transitions,
 )
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
 from torchrl_bmrl.objectives import BCQLoss
 
 pytestmark = pytest.mark.filterwarnings(NO_UPDATER)
@@ -270,3 +272,42 @@ def test_bounds_may_come_from_the_action_spec(spec: Any) -> None:
     assert loss.action_low.tolist() == [-1.0, -2.0]
     assert loss.action_high.tolist() == [0.5, 3.0]
     assert {"action_low", "action_high"} <= loss.state_dict().keys()
+
+
+def test_critics_of_other_structure_keep_it() -> None:
+    torch.manual_seed(0)
+    narrow, wide = (make_qvalue_network(3, 2, num_cells=cells) for cells in ((8,), (16, 16)))
+    swapped = TensorDictModule(
+        lambda action, observation: observation.sum(-1, keepdim=True) * action[..., :1],
+        in_keys=["action", "observation"],
+        out_keys=["state_action_value"],
+    )
+    loss = BCQLoss(ActionVAE(3, 2), [narrow, wide, swapped], bounds=(-1.0, 1.0))
+    data = transitions(8, dtype=torch.float32)
+    for own, critic in zip(loss.qvalue(data), (narrow, wide, swapped), strict=True):
+        expected = critic(data.select("observation", "action"))["state_action_value"].squeeze(-1)
+        torch.testing.assert_close(own, expected)
+    trained = {id(parameter) for parameter in loss.parameters()}
+    assert all(id(p) in trained for critic in (narrow, wide) for p in critic.parameters())
+
+
+@pytest.mark.parametrize(
+    ("bounds", "message"),
+    [
+        ((float("nan"), 1.0), "above the upper bound"),
+        ((torch.zeros(4, 2), torch.ones(4, 2)), r"shapes \(4, 2\) and \(4, 2\); valid"),
+    ],
+)
+def test_bounds_that_are_none_are_refused(bounds: Any, message: str) -> None:
+    with pytest.raises(BMRLError, match=message):
+        make_bcq_loss(bounds=bounds)
+
+
+def test_a_network_that_writes_another_key_or_has_none_is_named() -> None:
+    critic = make_qvalue_network(3, 2)
+    critic = TensorDictModule(critic.module, in_keys=critic.in_keys, out_keys=["q"])
+    loss = BCQLoss(ActionVAE(3, 2), critic, bounds=(-1.0, 1.0))
+    with pytest.raises(BMRLError, match=r"writes \['q'\], not 'state_action_value'"):
+        loss(transitions(8, dtype=torch.float32))
+    with pytest.raises(BMRLError, match="qvalue_network is a Linear; valid: a TensorDictModule"):
+        BCQLoss(ActionVAE(3, 2), torch.nn.Linear(3, 2), bounds=(-1.0, 1.0))

@@ -30,7 +30,7 @@ from torchrl.modules import MLP
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.functional import triplet_error
-from torchrl_bmrl.modules import PLASPolicy
+from torchrl_bmrl.modules import PLASPolicy, make_decoder, make_qvalue_network
 from torchrl_bmrl.objectives import MetaDistillationLoss, distillation
 
 Teachers = tuple[list[TensorDictModule], list[TensorDictModule]]
@@ -476,3 +476,36 @@ def test_as_many_generators_as_critics_are_needed() -> None:
             critics[:2],
             latent_dim=LATENT_DIM,
         )
+
+
+def test_a_teacher_of_another_action_is_refused_and_not_broadcast() -> None:
+    loss = MetaDistillationLoss(
+        *make_student_networks(TASKS, torch.float64),
+        [make_decoder(3, 1, LATENT_DIM).double() for _ in range(TASKS)],
+        [make_qvalue_network(3, 1).double() for _ in range(TASKS)],
+        latent_dim=LATENT_DIM,
+        context="current",
+    )
+    with pytest.raises(BMRLError, match=r"'action' has the shape \(3, 5, 1\); valid: \(3, 5, 2\)"):
+        loss(task_transitions(TASKS, ROWS))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda task: task.float(), r"'task' is torch.float32; valid: torch.int64"),
+        (lambda task: task + 1, "'task' holds 3; valid: 0 to 2"),
+    ],
+)
+def test_tasks_that_are_no_class_index_are_refused(change: Any, message: str) -> None:
+    data = task_transitions(TASKS, ROWS)
+    data["task"] = change(data["task"])
+    with pytest.raises(BMRLError, match=message):
+        make_distillation_loss()(data)
+
+
+def test_scales_of_the_values_are_checked() -> None:
+    with pytest.raises(BMRLError, match=r"qvalue_scale is .*above 0"):
+        make_distillation_loss(qvalue_scale=torch.zeros(TASKS))
+    with pytest.raises(BMRLError, match=r"qvalue_loc is .*each of the 3 tasks"):
+        make_distillation_loss(qvalue_loc=torch.zeros(2))

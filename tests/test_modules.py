@@ -20,27 +20,32 @@ from helpers import (
     transitions,
 )
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
 from torchrl.envs.utils import check_env_specs
+from torchrl.modules import QValueActor
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.modules import (
     ActionVAE,
     BCQPolicy,
     DemonstrationTaskLatent,
+    DiscreteBCQPolicy,
     OnlineTaskLatent,
+    PLASPolicy,
     PrototypeTaskLatent,
     make_decoder,
+    make_latent_actor,
     make_perturbation_network,
     make_qvalue_network,
     make_task_classifier,
     make_task_encoder,
     prototype,
 )
+from torchrl_bmrl.objectives import BCQLoss, DiscreteBCQLoss, PLASLoss
 
 DIMS = (OBSERVATION_DIM, ACTION_DIM)
 
@@ -528,3 +533,74 @@ def test_student_acts_in_an_environment_with_a_task_latent(encoder: TensorDictMo
         rollout = TransformedEnv(Walk(), transform).rollout(10, policy)
         assert rollout["action"].abs().max() <= 1.0
         assert len(rollout["action"].unique(dim=0)) == 6
+
+
+# -- policies of losses whose networks bring their own keys -------------------------------------
+
+
+def act(policy: TensorDictModuleBase, **entries: Tensor) -> Tensor:
+    rows = len(next(iter(entries.values())))
+    return policy(TensorDict(entries, [rows]))["action"]
+
+
+def test_a_discrete_policy_takes_the_best_action_of_a_q_value_actor() -> None:
+    torch.manual_seed(0)
+    network = nn.Linear(3, 4)
+    critic = QValueActor(network, in_keys=["observation"], action_space="one-hot")
+    generator = TensorDictModule(nn.Linear(3, 4), in_keys=["observation"], out_keys=["logits"])
+    policy = DiscreteBCQPolicy.from_loss(DiscreteBCQLoss(generator, critic, threshold=0.0))
+    observation = torch.randn(50, 3)
+    best = network(observation).argmax(-1)
+    assert torch.equal(act(policy, observation=observation).argmax(-1), best)
+    assert len(best.unique()) > 1
+
+
+class WithExtra(nn.Module):
+    """Writes something after the action."""
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        action = torch.cat(inputs, -1)[..., :ACTION_DIM].tanh()
+        return action, action.sum(-1, keepdim=True)
+
+
+@pytest.mark.parametrize("kind", ["bcq", "plas"])
+def test_a_policy_reads_what_its_networks_read_and_writes_the_action(kind: str) -> None:
+    generator = ActionVAE(*DIMS, num_cells=CELLS)
+    keys = ["observation", "action_latent"]
+    generator.decoder = TensorDictModule(WithExtra(), in_keys=keys, out_keys=["action", "extra"])
+    critic = TensorDictModule(
+        make_qvalue_network(5, ACTION_DIM, num_cells=CELLS).module,
+        in_keys=["state", "action"],
+        out_keys=["state_action_value"],
+    )
+    actor = make_latent_actor(6, LATENT_DIM, num_cells=CELLS).module
+    actor = TensorDictModule(actor, in_keys=["goal"], out_keys=["action_latent"])
+    entries = {"observation": torch.randn(6, OBSERVATION_DIM)}
+    if kind == "bcq":
+        policy = BCQPolicy.from_loss(BCQLoss(generator, critic, bounds=(-1.0, 1.0)))
+        entries["state"] = torch.randn(6, 5)
+    else:
+        policy = PLASPolicy.from_loss(PLASLoss(generator, actor, critic, bounds=(-1.0, 1.0)))
+        entries["goal"] = torch.randn(6, 6)
+    assert set(policy.in_keys) == set(entries)
+    assert act(policy, **entries).shape == (6, ACTION_DIM)
+
+
+class Scaled(nn.Module):
+    """Reads bytes."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, pixels: Tensor, other: Tensor) -> Tensor:
+        return self.network(pixels.float() / 255, other)
+
+
+def test_a_policy_acts_on_bytes() -> None:
+    generator, critic = ActionVAE(*DIMS, num_cells=CELLS), make_qvalue_network(*DIMS)
+    for module in (generator.decoder, critic):
+        module.module = Scaled(module.module)
+    policy = BCQPolicy(generator.decoder, critic, latent_dim=LATENT_DIM, num_candidates=5)
+    pixels = torch.randint(256, (6, OBSERVATION_DIM), dtype=torch.uint8)
+    assert act(policy, observation=pixels).shape == (6, ACTION_DIM)

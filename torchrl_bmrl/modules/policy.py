@@ -124,7 +124,7 @@ class BCQPolicy(TensorDictModuleBase):
         """Writes the action."""
         proposals = tensordict.select(*self.in_keys).unsqueeze(-1)
         proposals = proposals.expand(*tensordict.batch_size, self.num_candidates)
-        weight = next(self.decoder.parameters())
+        weight = next(self.parameters(), self.action_low)
         latent = sample_action_latent(
             (*proposals.batch_size, self.latent_dim),
             latent_clip=self.latent_clip,

@@ -107,6 +107,21 @@ def check_same_shape(key: NestedKey, value: Tensor, expected: Tensor) -> None:
         )
 
 
+def check_index(key: NestedKey, index: Tensor, count: int) -> None:
+    """Indices of a class; in a compiled loss or on another device than CPU only their type.
+
+    Raises:
+        BMRLError: for numbers that are not integers, or out of range.
+    """
+    if index.is_floating_point() or index.is_complex() or index.dtype == torch.bool:
+        raise BMRLError(f"{key!r} is {index.dtype}; valid: torch.int64")
+    if torch.compiler.is_compiling() or index.device.type != "cpu" or not index.numel():
+        return
+    low, high = int(index.min()), int(index.max())
+    if low < 0 or high >= count:
+        raise BMRLError(f"{key!r} holds {low if low < 0 else high}; valid: 0 to {count - 1}")
+
+
 def next_key(key: NestedKey) -> tuple[str, ...]:
     """The key under ``"next"``.
 

@@ -191,8 +191,9 @@ class OfflineLoss(LossModule):
     def finish(self) -> None:
         """Ends a subclass's ``__init__``: the value estimator, and who shares parameters."""
         self.make_value_estimator(self.default_value_estimator)
-        # Found once and kept: found at the first call, it would make a compiled loss compile again.
+        # Found once and kept: found at the first call, a compiled loss would compile again.
         self.set_vmap_randomness(self.vmap_randomness)
+        self._in_keys, self._out_keys = self.in_keys, self.out_keys
         generator = self._modules.get("generator_params")
         own = set() if generator is None else {id(p) for p in generator.parameters()}
         self._shared_with_generator = {
@@ -349,6 +350,8 @@ class OfflineLoss(LossModule):
         if self._value_estimator is not None:
             self._value_estimator.set_keys(**self._estimator_keys())
         self._in_keys = None
+        if self._out_keys is not None:  # construction is over
+            self._in_keys = self.in_keys
 
     # -- target, priority, reduction -------------------------------------------------------------
 
@@ -397,7 +400,10 @@ class OfflineLoss(LossModule):
         keys = self.tensor_keys
         next_value = next_value.unsqueeze(-1)
         for key in (next_key(key) for key in (keys.reward, keys.done, keys.terminated)):
-            shape = entry(tensordict, key).shape
+            value = entry(tensordict, key)
+            shape = value.shape
+            if key != next_key(keys.reward) and value.dtype != torch.bool:
+                raise BMRLError(f"{key!r} is {value.dtype}; valid: torch.bool")
             if shape != next_value.shape:
                 raise BMRLError(
                     f"{key!r} has the shape {tuple(shape)}; valid: {tuple(next_value.shape)}, the "
@@ -445,6 +451,8 @@ class OfflineLoss(LossModule):
         action = tensordict.get(key, None)
         if action is None:
             raise missing(tensordict, key)
+        if not action.numel():
+            raise BMRLError(f"{key!r} has the shape {tuple(action.shape)}; valid: one row at least")
         return action.shape[:-1]
 
     def rows(

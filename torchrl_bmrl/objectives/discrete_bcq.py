@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.functional import likely_actions
 from torchrl_bmrl.objectives.checks import (
+    check_index,
     check_network,
     check_number,
     entry,
@@ -203,13 +204,8 @@ class DiscreteBCQLoss(OfflineLoss):
         if self.action_space == "one-hot":
             return action.to(torch.uint8).argmax(-1)
         action = action.reshape(batch)
-        if not torch.compiler.is_compiling() and action.device.type == "cpu":
-            low, high = int(action.min()), int(action.max())
-            if low < 0 or high >= num_actions:
-                raise BMRLError(
-                    f"{key!r} holds {low if low < 0 else high}; valid: 0 to {num_actions - 1}"
-                )
-        return action
+        check_index(key, action, num_actions)
+        return action.long()
 
     def logits(self, tensordict: TensorDictBase, *, after: bool = False) -> Tensor:
         """Logits of the generator at the state or the one ``after``, ``(*B, n)``."""

@@ -20,7 +20,16 @@ from torchrl_bmrl.functional import (
     squared_error,
     triplet_error,
 )
-from torchrl_bmrl.objectives.checks import entry, priority_weight, read
+from torchrl_bmrl.objectives.checks import (
+    check_index,
+    check_network,
+    check_number,
+    check_same_shape,
+    entry,
+    output,
+    priority_weight,
+    read,
+)
 from torchrl_bmrl.objectives.common import REDUCTIONS
 from torchrl_bmrl.objectives.ensemble import FrozenEnsemble
 
@@ -206,13 +215,17 @@ class MetaDistillationLoss(LossModule):
             raise UnknownNameError("reduction", reduction, REDUCTIONS)
         if context not in CONTEXTS:
             raise UnknownNameError("context", context, CONTEXTS)
-        if not 0.0 <= context_fraction <= 1.0:
-            raise BMRLError(f"context_fraction is {context_fraction}; valid: between 0 and 1")
-        if context_size < 1:
-            raise BMRLError(f"context_size is {context_size}; valid: at least 1")
-        for term in encoder_terms:
+        check_number("context_fraction", context_fraction, 0, 1)
+        check_number("context_size", context_size, 1, integer=True)
+        check_number("latent_dim", latent_dim, 1, integer=True)
+        check_number("latent_clip", latent_clip, optional=True)
+        check_number("metric_margin", metric_margin)
+        if not teacher_generators:
+            raise BMRLError("no teachers; valid: at least one generator and critic")
+        for term in [encoder_terms] if isinstance(encoder_terms, str) else encoder_terms:
             if term not in ENCODER_TERMS:
                 raise UnknownNameError("encoder term", term, ENCODER_TERMS)
+        check_number("metric_weight", metric_weight)
         if metric_weight and len(teacher_generators) < 2:
             raise BMRLError("metric_weight needs at least two tasks, one to be away from")
         self._in_keys: list[NestedKey] | None = None
@@ -234,15 +247,23 @@ class MetaDistillationLoss(LossModule):
             ("student_generator", student_generator),
             ("student_qvalue_network", student_qvalue_network),
         ):
+            check_network(name, module)
             self.convert_to_functional(module, name, create_target_params=False)
         self.teacher_generators = FrozenEnsemble(teacher_generators)
         self.teacher_qvalue_networks = FrozenEnsemble(teacher_qvalue_networks)
         reference = next(student_generator.parameters())
         zeros = torch.zeros(self.num_tasks, device=reference.device, dtype=reference.dtype)
-        self.register_buffer("qvalue_loc", zeros if qvalue_loc is None else qvalue_loc.to(zeros))
-        self.register_buffer(
-            "qvalue_scale", zeros + 1 if qvalue_scale is None else qvalue_scale.to(zeros)
-        )
+        for name, given, default in (
+            ("qvalue_loc", qvalue_loc, zeros),
+            ("qvalue_scale", qvalue_scale, zeros + 1),
+        ):
+            buffer = default if given is None else torch.as_tensor(given).to(zeros)
+            if buffer.shape != zeros.shape or (name == "qvalue_scale" and not (buffer > 0).all()):
+                raise BMRLError(
+                    f"{name} is {buffer.tolist()}; valid: a number for each of the "
+                    f"{self.num_tasks} tasks{', above 0' * (name == 'qvalue_scale')}"
+                )
+            self.register_buffer(name, buffer)
         for name, value in (
             ("latent_clip", latent_clip),
             ("classification_weight", classification_weight),
@@ -252,9 +273,12 @@ class MetaDistillationLoss(LossModule):
             ("latent_norm_weight", latent_norm_weight),
             ("metric_weight", metric_weight or None),
         ):
+            if name not in ("latent_clip", "metric_weight"):
+                check_number(name, value)
             self.register_coeff_buffer(name, value, device=reference.device, dtype=reference.dtype)
-        # Found once and kept: found at the first call, it would make a compiled loss compile again.
+        # Found once and kept: found at the first call, a compiled loss would compile again.
         self.set_vmap_randomness(self.vmap_randomness)
+        self._in_keys, self._out_keys = self.in_keys, self.out_keys
 
     def _maybe_get_priority_weight(self, tensordict: TensorDictBase) -> Tensor | None:
         return priority_weight(self, tensordict)
@@ -264,6 +288,8 @@ class MetaDistillationLoss(LossModule):
 
     def _forward_value_estimator_keys(self, **kwargs: object) -> None:
         self._in_keys = None
+        if self._out_keys is not None:  # construction is over
+            self._in_keys = self.in_keys
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -339,7 +365,8 @@ class MetaDistillationLoss(LossModule):
 
     def _encode(self, transition: TensorDictBase) -> Tensor:
         with self.task_encoder_params.to_module(self.task_encoder, preserve_module_state=False):
-            return read(self.task_encoder, transition).get(self.tensor_keys.task_latent)
+            encoded = read(self.task_encoder, transition)
+            return output(encoded, self.tensor_keys.task_latent, self.task_encoder)
 
     @torch.no_grad()
     def teach(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -373,7 +400,11 @@ class MetaDistillationLoss(LossModule):
         with self.student_generator_params.to_module(
             self.student_generator, preserve_module_state=False
         ):
-            return self.student_generator(data).get(self.tensor_keys.action)
+            action = output(
+                read(self.student_generator, data), self.tensor_keys.action, self.student_generator
+            )
+        check_same_shape(self.tensor_keys.action, taught.get(self.tensor_keys.action), action)
+        return action
 
     def judge(self, taught: TensorDictBase, action: Tensor, task_latent: Tensor) -> Tensor:
         """Student's value of its own action, without a gradient into the action."""
@@ -383,7 +414,10 @@ class MetaDistillationLoss(LossModule):
         with self.student_qvalue_network_params.to_module(
             self.student_qvalue_network, preserve_module_state=False
         ):
-            return self.student_qvalue_network(data).get(keys.state_action_value)
+            network = self.student_qvalue_network
+            value = output(read(network, data), keys.state_action_value, network)
+        check_same_shape(keys.state_action_value, taught.get(keys.state_action_value), value)
+        return value
 
     def classify(self, task_latent: Tensor) -> Tensor:
         """Logits of the task, ``(num_tasks, B, num_tasks)``."""
@@ -392,7 +426,14 @@ class MetaDistillationLoss(LossModule):
         with self.task_classifier_params.to_module(
             self.task_classifier, preserve_module_state=False
         ):
-            return self.task_classifier(data).get(keys.task_logits)
+            network = self.task_classifier
+            logits = output(read(network, data), keys.task_logits, network)
+        if logits.shape[-1] != self.num_tasks:
+            raise BMRLError(
+                f"{keys.task_logits!r} has the shape {tuple(logits.shape)}; valid: "
+                f"{(*task_latent.shape[:-1], self.num_tasks)}, a number for each task"
+            )
+        return logits
 
     def separate(self, task_latent: Tensor) -> Tensor:
         """Triplet error of each row's m against another row of its task and one of another."""
@@ -420,10 +461,13 @@ class MetaDistillationLoss(LossModule):
                 f"{self.tensor_keys.task!r} has the shape {tuple(task.shape)}; valid: "
                 f"{tuple(tensordict.batch_size)}"
             )
+        check_index(self.tensor_keys.task, task, self.num_tasks)
         m = self.embed(tensordict)
         reaching = {term: m if term in self.encoder_terms else m.detach() for term in ENCODER_TERMS}
         logits = self.classify(reaching["classification"])
-        cross_entropy = F.cross_entropy(logits.flatten(0, 1), task.flatten(), reduction="none")
+        cross_entropy = F.cross_entropy(
+            logits.flatten(0, 1), task.flatten().long(), reduction="none"
+        )
         taught = self.teach(tensordict)
         target = taught.get(self.tensor_keys.action)
         action = {"generator": self.imitate(taught, reaching["generator"])}

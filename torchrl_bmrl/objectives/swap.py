@@ -30,7 +30,7 @@ def holding(module: nn.Module, params: TensorDictBase | list[Tensor]) -> Iterato
     Example:
         >>> module = nn.Linear(1, 1)
         >>> with holding(module, TensorDict.from_module(module).data * 0):
-        ...     module(torch.ones(1))
+        ...     module(torch.ones(1)).abs()
         tensor([0.])
         >>> isinstance(module.weight, nn.Parameter)
         True
