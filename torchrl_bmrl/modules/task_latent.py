@@ -8,7 +8,6 @@ Three environment transforms write ``task_latent`` for it: :class:`PrototypeTask
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -210,11 +209,3 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Not defined outside an environment: the alignment needs an episode."""
         raise BMRLError("DemonstrationTaskLatent acts in an environment, not on stored data")
-
-
-TASK_LATENT_SOURCES: dict[str, Any] = {
-    "prototype": PrototypeTaskLatent,
-    "online": OnlineTaskLatent,
-    "demonstration": DemonstrationTaskLatent,
-}
-"""The three sources of m by the name that tables use."""

@@ -1,5 +1,6 @@
 """Offline losses in TorchRL's contract."""
 
+from torchrl_bmrl.objectives.base import KeyedLoss
 from torchrl_bmrl.objectives.bcq import BCQLoss
 from torchrl_bmrl.objectives.common import OfflineLoss
 from torchrl_bmrl.objectives.discrete_bcq import DiscreteBCQLoss
@@ -11,6 +12,7 @@ __all__ = [
     "BCQLoss",
     "DiscreteBCQLoss",
     "GenerativeLoss",
+    "KeyedLoss",
     "MetaDistillationLoss",
     "OfflineLoss",
     "PLASLoss",

@@ -10,7 +10,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives import LossModule
 
 from torchrl_bmrl.errors import BMRLError
 
@@ -167,13 +166,6 @@ def missing(tensordict: TensorDictBase, key: NestedKey) -> BMRLError:
     """The error for an entry that the data lack."""
     present = [str(key) for key in tensordict.keys(include_nested=True, leaves_only=True)]
     return BMRLError(f"the data have no {key!r}; they have: {', '.join(present) or 'nothing'}")
-
-
-def priority_weight(loss: LossModule, tensordict: TensorDictBase) -> Tensor | None:
-    """Weights of the rows, also under a nested key, which TorchRL's own does not find."""
-    if loss.use_prioritized_weights not in (True, "auto"):
-        return None
-    return tensordict.get(loss.tensor_keys.priority_weight, None)
 
 
 def read(module: TensorDictModule, tensordict: TensorDictBase) -> TensorDictBase:

@@ -23,6 +23,7 @@ from torchrl.objectives.utils import (
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
+from torchrl_bmrl.objectives.base import KeyedLoss
 from torchrl_bmrl.objectives.checks import (
     check_network,
     check_number,
@@ -30,19 +31,17 @@ from torchrl_bmrl.objectives.checks import (
     missing,
     next_key,
     output,
-    priority_weight,
     read,
 )
 from torchrl_bmrl.objectives.ensemble import kind
 from torchrl_bmrl.objectives.swap import holding, leaves, without_gradient
 
 LOSS_FUNCTIONS = ("l2", "l1", "smooth_l1")
-REDUCTIONS = ("mean", "sum", "none")
 
 Self = TypeVar("Self", bound="OfflineLoss")
 
 
-class OfflineLoss(LossModule):
+class OfflineLoss(KeyedLoss):
     """Base of losses that learn one critic, or an ensemble of them, from a fixed batch.
 
     It brings the critics (:meth:`convert_critics`), the value estimators, the reduction with masks
@@ -107,27 +106,18 @@ class OfflineLoss(LossModule):
         deactivate_vmap: bool = False,
         use_prioritized_weights: str | bool = "auto",
     ) -> None:
-        super().__init__()
+        super().__init__(
+            reduction=reduction,
+            deactivate_vmap=deactivate_vmap,
+            use_prioritized_weights=use_prioritized_weights,
+        )
         if loss_function not in LOSS_FUNCTIONS:
             raise UnknownNameError("loss_function", loss_function, LOSS_FUNCTIONS)
-        if reduction not in REDUCTIONS:
-            raise UnknownNameError("reduction", reduction, REDUCTIONS)
-        self._in_keys: list[NestedKey] | None = None
-        self._out_keys: list[str] | None = None
         self.gamma = check_number("gamma", gamma, 0, 1)
         self.loss_function = loss_function
         self.separate_losses = separate_losses
-        self.reduction = reduction
-        self.deactivate_vmap = deactivate_vmap
-        self.use_prioritized_weights = use_prioritized_weights
 
     # -- construction ----------------------------------------------------------------------------
-
-    def register_coefficients(self, **values: float | None) -> None:
-        """Makes hyper-parameters buffers of the networks' type and device; ``None`` stays so."""
-        reference = next(self.parameters())
-        for name, value in values.items():
-            self.register_coeff_buffer(name, value, device=reference.device, dtype=reference.dtype)
 
     def convert_critics(
         self,
@@ -191,9 +181,7 @@ class OfflineLoss(LossModule):
     def finish(self) -> None:
         """Ends a subclass's ``__init__``: the value estimator, and who shares parameters."""
         self.make_value_estimator(self.default_value_estimator)
-        # Found once and kept: found at the first call, a compiled loss would compile again.
-        self.set_vmap_randomness(self.vmap_randomness)
-        self._in_keys, self._out_keys = self.in_keys, self.out_keys
+        self.keep_keys()
         generator = self._modules.get("generator_params")
         own = set() if generator is None else {id(p) for p in generator.parameters()}
         self._shared_with_generator = {
@@ -205,9 +193,6 @@ class OfflineLoss(LossModule):
             for name, params in self.named_children()
             if isinstance(params, TensorDictParams)
         }
-
-    def _make_vmap(self) -> None:
-        """Nothing is cached that ``set_vmap_randomness`` would have to renew."""
 
     def critic(self, index: int = 0) -> tuple[TensorDictModule, TensorDictBase]:
         """One critic: its module and the parameters that belong into it."""
@@ -270,14 +255,13 @@ class OfflineLoss(LossModule):
         if not self._stacked:
             values = self.call("qvalue_network", inputs, target=target, frozen=frozen)
             return output(values, key, network)
-        weights = self.weights("qvalue_network", target=target, frozen=frozen)
-        if isinstance(weights, list):
-            each: Any = map(list, zip(*(leaf.unbind(0) for leaf in weights), strict=True))
-        else:
-            each = weights.unbind(0)
-        device = next(self.parameters()).device
-        if self.deactivate_vmap or device.type == "cpu":
+        if self.deactivate_vmap or next(self.parameters()).device.type == "cpu":
             # On CPU a batched matrix product is slower than one product after the other.
+            weights = self.weights("qvalue_network", target=target, frozen=frozen)
+            if isinstance(weights, list):
+                each: Any = map(list, zip(*(leaf.unbind(0) for leaf in weights), strict=True))
+            else:
+                each = weights.unbind(0)
             outputs = []
             for own in each:
                 with holding(network, own):
@@ -305,37 +289,11 @@ class OfflineLoss(LossModule):
 
     # -- keys ------------------------------------------------------------------------------------
 
-    def read_keys(self) -> Iterable[NestedKey]:
-        """Keys that the loss reads beside reward, done and terminated; duplicates are dropped."""
-        raise NotImplementedError
-
-    def written_keys(self) -> list[str]:
-        """Keys that ``forward`` returns, in order."""
-        raise NotImplementedError
-
     @property
-    def in_keys(self) -> list[NestedKey]:
-        """Keys read from the input, in a stable order."""
-        if self._in_keys is None:
-            keys = self.tensor_keys
-            ends = (next_key(key) for key in (keys.reward, keys.done, keys.terminated))
-            self._in_keys = list(dict.fromkeys([*self.read_keys(), *ends]))
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
-
-    @property
-    def out_keys(self) -> list[str]:
-        """Keys of the output, in the order of keyword dispatch."""
-        if self._out_keys is None:
-            self._out_keys = self.written_keys()
-        return self._out_keys
-
-    @out_keys.setter
-    def out_keys(self, values: list[str]) -> None:
-        self._out_keys = values
+    def outcome_keys(self) -> list[NestedKey]:
+        """Where reward, done and terminated lie."""
+        keys = self.tensor_keys
+        return [next_key(key) for key in (keys.reward, keys.done, keys.terminated)]
 
     def _estimator_keys(self) -> dict[str, NestedKey]:
         keys = self.tensor_keys
@@ -349,9 +307,7 @@ class OfflineLoss(LossModule):
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         if self._value_estimator is not None:
             self._value_estimator.set_keys(**self._estimator_keys())
-        self._in_keys = None
-        if self._out_keys is not None:  # construction is over
-            self._in_keys = self.in_keys
+        super()._forward_value_estimator_keys()
 
     # -- target, priority, reduction -------------------------------------------------------------
 
@@ -399,7 +355,7 @@ class OfflineLoss(LossModule):
         """
         keys = self.tensor_keys
         next_value = next_value.unsqueeze(-1)
-        for key in (next_key(key) for key in (keys.reward, keys.done, keys.terminated)):
+        for key in self.outcome_keys:
             value = entry(tensordict, key)
             shape = value.shape
             if key != next_key(keys.reward) and value.dtype != torch.bool:
@@ -434,14 +390,6 @@ class OfflineLoss(LossModule):
             "target_value": target.mean(),
             "next_state_value": next_value.detach().mean(),
         }
-
-    def _maybe_get_priority_weight(self, tensordict: TensorDictBase) -> Tensor | None:
-        return priority_weight(self, tensordict)
-
-    def reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """Reduces ``(*B,)`` with the data's masks and priority weights."""
-        weights = self._maybe_get_priority_weight(tensordict)
-        return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
 
     # -- data ------------------------------------------------------------------------------------
 

@@ -152,11 +152,12 @@ class DiscreteBCQLoss(OfflineLoss):
         self.finish()
 
     def read_keys(self) -> list[NestedKey]:
-        """Observation and action, and the next observation."""
+        """Observation and action, and what followed."""
         return [
             *self.observation_keys,
             self.tensor_keys.action,
             *map(next_key, self.observation_keys),
+            *self.outcome_keys,
         ]
 
     @property

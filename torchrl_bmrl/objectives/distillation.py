@@ -11,7 +11,6 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn import functional as F
-from torchrl.objectives.common import LossModule
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.functional import (
@@ -20,6 +19,7 @@ from torchrl_bmrl.functional import (
     squared_error,
     triplet_error,
 )
+from torchrl_bmrl.objectives.base import KeyedLoss
 from torchrl_bmrl.objectives.checks import (
     check_index,
     check_network,
@@ -27,17 +27,16 @@ from torchrl_bmrl.objectives.checks import (
     check_same_shape,
     entry,
     output,
-    priority_weight,
     read,
 )
-from torchrl_bmrl.objectives.common import REDUCTIONS
 from torchrl_bmrl.objectives.ensemble import FrozenEnsemble
+from torchrl_bmrl.objectives.swap import holding
 
 CONTEXTS = ("current", "previous", "random", "set")
 ENCODER_TERMS = ("classification", "generator", "direction", "qvalue", "metric")
 
 
-class MetaDistillationLoss(LossModule):
+class MetaDistillationLoss(KeyedLoss):
     r"""Distils one generator and one critic per task into a single pair conditioned on m.
 
     Reference: *Compositional Skill Learning Using Batch Meta RL*, section 6.2. With
@@ -205,14 +204,16 @@ class MetaDistillationLoss(LossModule):
         deactivate_vmap: bool = False,
         use_prioritized_weights: str | bool = "auto",
     ) -> None:
-        super().__init__()
+        super().__init__(
+            reduction=reduction,
+            deactivate_vmap=deactivate_vmap,
+            use_prioritized_weights=use_prioritized_weights,
+        )
         if len(teacher_generators) != len(teacher_qvalue_networks):
             raise BMRLError(
                 f"{len(teacher_generators)} teacher_generators and {len(teacher_qvalue_networks)} "
                 "teacher_qvalue_networks; valid: one of each per task"
             )
-        if reduction not in REDUCTIONS:
-            raise UnknownNameError("reduction", reduction, REDUCTIONS)
         if context not in CONTEXTS:
             raise UnknownNameError("context", context, CONTEXTS)
         check_number("context_fraction", context_fraction, 0, 1)
@@ -228,8 +229,6 @@ class MetaDistillationLoss(LossModule):
         check_number("metric_weight", metric_weight)
         if metric_weight and len(teacher_generators) < 2:
             raise BMRLError("metric_weight needs at least two tasks, one to be away from")
-        self._in_keys: list[NestedKey] | None = None
-        self._out_keys: list[str] | None = None
         self.num_tasks = len(teacher_generators)
         self.latent_dim = latent_dim
         self.context = context
@@ -237,9 +236,6 @@ class MetaDistillationLoss(LossModule):
         self.context_size = context_size
         self.encoder_terms = tuple(encoder_terms)
         self.metric_margin = metric_margin
-        self.reduction = reduction
-        self.deactivate_vmap = deactivate_vmap
-        self.use_prioritized_weights = use_prioritized_weights
 
         for name, module in (
             ("task_encoder", task_encoder),
@@ -265,67 +261,37 @@ class MetaDistillationLoss(LossModule):
                 )
             self.register_buffer(name, buffer)
         for name, value in (
-            ("latent_clip", latent_clip),
             ("classification_weight", classification_weight),
             ("generator_weight", generator_weight),
             ("direction_weight", direction_weight),
             ("qvalue_weight", qvalue_weight),
             ("latent_norm_weight", latent_norm_weight),
-            ("metric_weight", metric_weight or None),
         ):
-            if name not in ("latent_clip", "metric_weight"):
-                check_number(name, value)
-            self.register_coeff_buffer(name, value, device=reference.device, dtype=reference.dtype)
-        # Found once and kept: found at the first call, a compiled loss would compile again.
-        self.set_vmap_randomness(self.vmap_randomness)
-        self._in_keys, self._out_keys = self.in_keys, self.out_keys
+            self.register_coefficients(**{name: check_number(name, value)})
+        self.register_coefficients(latent_clip=latent_clip, metric_weight=metric_weight or None)
+        self.keep_keys()
 
-    def _maybe_get_priority_weight(self, tensordict: TensorDictBase) -> Tensor | None:
-        return priority_weight(self, tensordict)
+    def read_keys(self) -> list[NestedKey]:
+        """The transition that m is computed from, what the teachers read, and the task."""
+        keys = [*self.task_encoder.in_keys, *self._teacher_observation_keys]
+        keys.append(self.tensor_keys.task)
+        if self.context == "previous":
+            previous = self.tensor_keys.previous
+            keys += [unravel_key((previous, key)) for key in self.task_encoder.in_keys]
+        return keys
 
-    def _make_vmap(self) -> None:
-        """Nothing is cached that ``set_vmap_randomness`` would have to renew."""
-
-    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
-        self._in_keys = None
-        if self._out_keys is not None:  # construction is over
-            self._in_keys = self.in_keys
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Keys read from the input, in a stable order."""
-        if self._in_keys is None:
-            keys = [*self.task_encoder.in_keys, *self._teacher_observation_keys]
-            keys.append(self.tensor_keys.task)
-            if self.context == "previous":
-                previous = self.tensor_keys.previous
-                keys += [unravel_key((previous, key)) for key in self.task_encoder.in_keys]
-            self._in_keys = list(dict.fromkeys(keys))
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
-
-    @property
-    def out_keys(self) -> list[str]:
-        """Keys of the output, in the order of keyword dispatch."""
-        if self._out_keys is None:
-            self._out_keys = [
-                "loss_classification",
-                "loss_generator",
-                "loss_direction",
-                "loss_qvalue",
-                "loss_latent_norm",
-                *(["loss_metric"] if self.metric_weight is not None else []),
-                "accuracy",
-                "latent_norm",
-            ]
-        return self._out_keys
-
-    @out_keys.setter
-    def out_keys(self, values: list[str]) -> None:
-        self._out_keys = values
+    def written_keys(self) -> list[str]:
+        """The weighted terms, then metrics."""
+        return [
+            "loss_classification",
+            "loss_generator",
+            "loss_direction",
+            "loss_qvalue",
+            "loss_latent_norm",
+            *(["loss_metric"] if self.metric_weight is not None else []),
+            "accuracy",
+            "latent_norm",
+        ]
 
     @property
     def _teacher_observation_keys(self) -> list[NestedKey]:
@@ -364,9 +330,13 @@ class MetaDistillationLoss(LossModule):
         return torch.where(chosen.unsqueeze(-1), other, latent)
 
     def _encode(self, transition: TensorDictBase) -> Tensor:
-        with self.task_encoder_params.to_module(self.task_encoder, preserve_module_state=False):
-            encoded = read(self.task_encoder, transition)
-            return output(encoded, self.tensor_keys.task_latent, self.task_encoder)
+        return self._run("task_encoder", transition, self.tensor_keys.task_latent)
+
+    def _run(self, name: str, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+        """What one of the trained networks writes under a key."""
+        network = getattr(self, name)
+        with holding(network, getattr(self, f"{name}_params")):
+            return output(read(network, tensordict), key, network)
 
     @torch.no_grad()
     def teach(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -397,12 +367,7 @@ class MetaDistillationLoss(LossModule):
         """Student's action for the teachers' observations and latents."""
         data = taught.select(*self._teacher_observation_keys, self.tensor_keys.action_latent)
         data = data.copy().set(self.tensor_keys.task_latent, task_latent)
-        with self.student_generator_params.to_module(
-            self.student_generator, preserve_module_state=False
-        ):
-            action = output(
-                read(self.student_generator, data), self.tensor_keys.action, self.student_generator
-            )
+        action = self._run("student_generator", data, self.tensor_keys.action)
         check_same_shape(self.tensor_keys.action, taught.get(self.tensor_keys.action), action)
         return action
 
@@ -411,11 +376,7 @@ class MetaDistillationLoss(LossModule):
         keys = self.tensor_keys
         data = taught.select(*self._teacher_observation_keys).copy()
         data.set(keys.action, action.detach()).set(keys.task_latent, task_latent)
-        with self.student_qvalue_network_params.to_module(
-            self.student_qvalue_network, preserve_module_state=False
-        ):
-            network = self.student_qvalue_network
-            value = output(read(network, data), keys.state_action_value, network)
+        value = self._run("student_qvalue_network", data, keys.state_action_value)
         check_same_shape(keys.state_action_value, taught.get(keys.state_action_value), value)
         return value
 
@@ -423,11 +384,7 @@ class MetaDistillationLoss(LossModule):
         """Logits of the task, ``(num_tasks, B, num_tasks)``."""
         keys = self.tensor_keys
         data = TensorDict({keys.task_latent: task_latent}, task_latent.shape[:-1])
-        with self.task_classifier_params.to_module(
-            self.task_classifier, preserve_module_state=False
-        ):
-            network = self.task_classifier
-            logits = output(read(network, data), keys.task_logits, network)
+        logits = self._run("task_classifier", data, keys.task_logits)
         if logits.shape[-1] != self.num_tasks:
             raise BMRLError(
                 f"{keys.task_logits!r} has the shape {tuple(logits.shape)}; valid: "
@@ -489,11 +446,7 @@ class MetaDistillationLoss(LossModule):
         if self.metric_weight is not None:
             terms["loss_metric"] = self.metric_weight * self.separate(reaching["metric"])
         tensordict.set(self.tensor_keys.priority, sum(terms.values()).detach())
-        weights = self._maybe_get_priority_weight(tensordict)
-        losses = {
-            name: self._reduce_loss(term, tensordict=tensordict, weights=weights)
-            for name, term in terms.items()
-        }
+        losses = {name: self.reduce(term, tensordict) for name, term in terms.items()}
         losses["accuracy"] = (logits.argmax(-1) == task).to(logits.dtype).mean()
         losses["latent_norm"] = norm.detach().mean().sqrt()
         self._clear_weakrefs(tensordict, taught, "student_generator_params")

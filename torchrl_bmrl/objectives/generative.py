@@ -139,9 +139,10 @@ class GenerativeLoss(OfflineLoss):
         return [key for key in dict.fromkeys(keys) if key not in made]
 
     def read_keys(self) -> Iterable[NestedKey]:
-        """Observation and action, and the next observation."""
+        """Observation and action, and what followed."""
         now = dict.fromkeys([*self.generator.encoder.in_keys, *self.observation_keys])
-        return [*now, self.tensor_keys.action, *map(next_key, self.observation_keys)]
+        after = map(next_key, self.observation_keys)
+        return [*now, self.tensor_keys.action, *after, *self.outcome_keys]
 
     # -- from a latent to an action --------------------------------------------------------------
 
