@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import io
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -338,6 +339,15 @@ def test_the_summary_counts_the_successes(tmp_path: Path) -> None:
     shares = [mean(rows, t, "distilled", "online") / mean(rows, t, "bcq") for t in TASKS[:2]]
     assert f"between {min(shares):.1%}" in text
     assert f"and {max(shares):.1%}" in text
+
+
+def test_the_summary_names_no_worst_task_where_none_failed(tmp_path: Path) -> None:
+    rows = [row for row in make_rows(("reach", "lift")) if row.policy == "expert"]
+    won = [replace(row, policy=p, success=True) for row in rows for p in ("expert", "bcq")]
+    write_results(tmp_path / "results.csv", won)
+    text = write_report(tmp_path, default_source="online", facts={}).read_text(encoding="utf-8")
+    assert "solved all of 20 episodes" in text
+    assert "least often" not in text
 
 
 def test_a_figure_without_data_is_left_out_and_the_page_says_so(tmp_path: Path) -> None:

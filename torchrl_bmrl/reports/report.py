@@ -205,6 +205,8 @@ def _successes(summaries: Sequence[Summary]) -> str:
     """How often the policies of some tasks succeeded, and where least."""
     episodes = sum(s.episodes for s in summaries)
     successes = round(sum(s.success_rate * s.episodes for s in summaries))
+    if successes == episodes:
+        return f"solved all of {episodes} episodes"
     worst = min(summaries, key=lambda s: s.success_rate)
     return (
         f"solved {successes} of {episodes} episodes (least often on {task_name(worst.task)}: "
