@@ -20,16 +20,27 @@ torch.set_num_threads(1)
 _NEEDS = {
     "gymnasium": ["torchrl_bmrl/envs/*"],
     "h5py": [
-        "torchrl_bmrl/data/minari.py",
-        "torchrl_bmrl/data/robomimic.py",
-        "torchrl_bmrl/data/schema.py",
+        *(
+            f"torchrl_bmrl/data/{name}.py"
+            for name in (
+                "__main__",
+                "convert",
+                "datasets",
+                "demonstrations",
+                "hdf5",
+                "minari",
+                "recordings",
+                "robomimic",
+                "robosuite",
+            )
+        ),
         "torchrl_bmrl/experts/*",
     ],
     "matplotlib": ["torchrl_bmrl/reports/*"],
     "robosuite": ["torchrl_bmrl/envs/*", "torchrl_bmrl/experts/*"],
     "safetensors": ["torchrl_bmrl/checkpoint.py"],
     "scipy": ["torchrl_bmrl/evaluation/*", "torchrl_bmrl/reports/*"],
-    "tqdm": ["torchrl_bmrl/parallel.py"],
+    "tqdm": ["torchrl_bmrl/data/__main__.py", "torchrl_bmrl/parallel.py"],
 }
 collect_ignore_glob = sorted(
     {glob for package, globs in _NEEDS.items() if find_spec(package) is None for glob in globs}

@@ -20,8 +20,12 @@ from omegaconf import DictConfig
 from settings import Config, run_recipe
 
 from torchrl_bmrl.agents import load_bcq_loss, load_student
-from torchrl_bmrl.data.demonstrations import demonstration_path, load_transitions, read_statistics
-from torchrl_bmrl.data.robomimic import read_demonstrations
+from torchrl_bmrl.data.demonstrations import (
+    demonstration_path,
+    load_transitions,
+    read_demonstrations,
+    read_statistics,
+)
 from torchrl_bmrl.envs.transforms import make_env
 from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome, evaluate_policy
@@ -84,16 +88,19 @@ def expert_outcomes(config: Config, task: str, seeds: list[int]) -> list[Episode
     """The expert's episodes: fresh ones on the evaluation's starts, or its demonstrations."""
     if config.evaluate.expert_rollouts:
         return [
-            EpisodeOutcome(float(episode.rewards.sum()), bool(episode.successes.any()))
+            EpisodeOutcome(float(episode.rewards.sum()), bool(episode.extras["successes"].any()))
             for episode in (
                 collect_episode(task, seed, noise=config.collect.noise, gains=config.collect.gains)
                 for seed in seeds
             )
         ]
-    demonstrations = read_demonstrations(demonstration_path(Path(config.run_dir) / "data", task))
+    path = demonstration_path(Path(config.run_dir) / "data", task)
+    data = read_demonstrations(path, num_task=config.tasks.index(task))
     return [
-        EpisodeOutcome(float(demo["rewards"].sum()), bool(demo["successes"].any()))
-        for demo in demonstrations
+        EpisodeOutcome(
+            float(episode["next", "reward"].double().sum()), bool(episode["next", "success"].any())
+        )
+        for episode in (data[data["episode"] == i] for i in data["episode"].unique())
     ]
 
 
@@ -105,9 +112,8 @@ def embed_held_out(config: Config) -> tuple[Embeddings, float]:
     held_out, distances = [], []
     for index, task in enumerate(config.tasks):
         held_out.append(load_transitions(data_dir, task, statistics, split="valid", num_task=index))
-        for demo in read_demonstrations(demonstration_path(data_dir, task), split="valid"):
-            offset = demo["obs"]["robot0_eef_pos"] - demo["obs"]["goal_pos"]
-            distances.append(np.linalg.norm(offset, axis=-1))
+        raw = read_demonstrations(demonstration_path(data_dir, task), split="valid", num_task=index)
+        distances.append((raw["robot0_eef_pos"] - raw["goal_pos"]).norm(dim=-1).numpy())
     data = torch.cat([part.select(*held_out[0].keys(True, True)) for part in held_out])
     # Class indices are positions in config.tasks; the report's are positions among all tasks.
     position = torch.tensor([TASKS.index(task) for task in config.tasks])

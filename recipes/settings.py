@@ -93,6 +93,16 @@ class EvaluateSettings:
 
 
 @dataclass
+class HumanSettings:
+    """People's demonstrations of lift beside the scripted ones (learn_from_people.py)."""
+
+    path: str = ""  # robosuite's demo.hdf5, or a file in robomimic's layout
+    shares: list[float] = field(default_factory=lambda: [0.0, 0.1, 0.3])  # of each batch
+    training_seeds: int = 2  # agents of each share
+    tracking: float = 1.0  # see docs/data.md; 1 takes plain differences for actions
+
+
+@dataclass
 class Config:
     """Everything that decides a run; ``config.yaml`` in the run folder is one of these."""
 
@@ -107,6 +117,7 @@ class Config:
     bcq: BCQSettings = field(default_factory=BCQSettings)
     distill: DistillSettings = field(default_factory=DistillSettings)
     evaluate: EvaluateSettings = field(default_factory=EvaluateSettings)
+    human: HumanSettings = field(default_factory=HumanSettings)
 
 
 POSITIVE = (
@@ -127,6 +138,8 @@ POSITIVE = (
     "distill.context_size",
     "evaluate.episodes",
     "evaluate.num_candidates",
+    "human.training_seeds",
+    "human.tracking",
 )
 CHOICES = {
     "logger": LOGGERS,
@@ -176,6 +189,9 @@ def check_settings(config: Config) -> None:
     for term in config.distill.encoder_terms:
         if term not in ENCODER_TERMS:
             raise UnknownNameError("encoder term", term, ENCODER_TERMS)
+    shares = config.human.shares
+    if 0 not in shares or len(set(shares)) < len(shares) or not all(0 <= x <= 1 for x in shares):
+        raise ConfigError(f"human.shares is {shares}; valid: 0 and others up to 1, each once")
     if config.collect.valid_episodes < 1 or min(config.collect.train_episodes.values()) < 1:
         raise ConfigError("collect.train_episodes and collect.valid_episodes; valid: at least 1")
 

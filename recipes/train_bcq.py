@@ -18,13 +18,14 @@ import torch
 from omegaconf import DictConfig
 from settings import Config, run_recipe
 from torch.nn.utils import clip_grad_norm_
+from torchrl.data import ReplayBuffer
 from torchrl.objectives import SoftUpdate
 
 from torchrl_bmrl.agents import make_bcq_loss
 from torchrl_bmrl.checkpoint import load_checkpoint, load_state, save_checkpoint
 from torchrl_bmrl.data import make_replay_buffer
 from torchrl_bmrl.data.demonstrations import load_transitions, read_statistics
-from torchrl_bmrl.envs.transforms import make_env
+from torchrl_bmrl.envs.transforms import ObservationStatistics, make_env
 from torchrl_bmrl.evaluation.rollout import evaluate_policy
 from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.modules import BCQPolicy
@@ -50,17 +51,29 @@ LOSS_SETTINGS = (
 def train_task(job: tuple[Config, str], report: Report) -> None:
     """Trains one task's agent, or goes on from its checkpoint."""
     config, task = job
-    settings, run_dir = config.bcq, Path(config.run_dir)
-    path = run_dir / "bcq" / task / "checkpoint.safetensors"
-    total = settings.epochs * settings.updates_per_epoch
-    statistics = read_statistics(run_dir / "data")
+    data_dir = Path(config.run_dir) / "data"
+    statistics = read_statistics(data_dir)
     data = load_transitions(
-        run_dir / "data", task, statistics, split="train", num_task=config.tasks.index(task)
+        data_dir, task, statistics, split="train", num_task=config.tasks.index(task)
     )
-    buffer = make_replay_buffer(data, batch_size=settings.batch_size)
+    buffer = make_replay_buffer(data, batch_size=config.bcq.batch_size)
+    train_agent(config, task, task, buffer, statistics, report)
 
-    torch.manual_seed(derive_seed(config.seed, "bcq", task))
-    options = {name: getattr(settings, name) for name in LOSS_SETTINGS}
+
+def train_agent(
+    config: Config,
+    task: str,
+    name: str,
+    buffer: ReplayBuffer,
+    statistics: ObservationStatistics,
+    report: Report,
+) -> None:
+    """Trains the agent that is kept under ``bcq/<name>``, or goes on from its checkpoint."""
+    settings, run_dir = config.bcq, Path(config.run_dir)
+    path = run_dir / "bcq" / name / "checkpoint.safetensors"
+    total = settings.epochs * settings.updates_per_epoch
+    torch.manual_seed(derive_seed(config.seed, "bcq", name))
+    options = {option: getattr(settings, option) for option in LOSS_SETTINGS}
     loss = make_bcq_loss(**options)
     target_updater = SoftUpdate(loss, tau=settings.tau)
     parts = {"generator": loss.generator_loss, "qvalue": loss.qvalue_loss}
@@ -69,38 +82,38 @@ def train_task(job: tuple[Config, str], report: Report) -> None:
         parts["perturbation"] = loss.perturbation_loss
         networks["perturbation"] = loss.perturbation_network_params
     optimizers = {
-        name: torch.optim.Adam(params.parameters(), lr=settings.lr)
-        for name, params in networks.items()
+        network: torch.optim.Adam(params.parameters(), lr=settings.lr)
+        for network, params in networks.items()
     }
     done, evaluations = 0, []
     if path.exists():
         state, metadata = load_checkpoint(path, kind="bcq")
         load_state(loss, state["loss"], path)
-        for name, optimizer in optimizers.items():
-            optimizer.load_state_dict(state["optimizers"][name])
+        for network, optimizer in optimizers.items():
+            optimizer.load_state_dict(state["optimizers"][network])
         torch.set_rng_state(state["rng"])
         done, evaluations = metadata["updates"], metadata["evaluations"]
         report(done)
-    logger = make_logger(config.logger, run_dir, f"bcq_{task}") if done < total else None
+    logger = make_logger(config.logger, run_dir, f"bcq_{name}") if done < total else None
 
     for update in range(done + 1, total + 1):
         batch = buffer.sample()
         metrics = {}
-        for name, part in parts.items():  # in update order: generator, critics, perturbation
-            if name != "generator" and update <= settings.generator_warmup:
+        for network, part in parts.items():  # in update order: generator, critics, perturbation
+            if network != "generator" and update <= settings.generator_warmup:
                 continue
             value, info = part(batch)
-            optimizers[name].zero_grad(set_to_none=True)
+            optimizers[network].zero_grad(set_to_none=True)
             value.backward()
-            if name == "qvalue" and settings.critic_grad_clip is not None:
-                clip_grad_norm_(networks[name].parameters(), settings.critic_grad_clip)
-            optimizers[name].step()
-            metrics |= {f"loss_{name}": value.detach()} | info
+            if network == "qvalue" and settings.critic_grad_clip is not None:
+                clip_grad_norm_(networks[network].parameters(), settings.critic_grad_clip)
+            optimizers[network].step()
+            metrics |= {f"loss_{network}": value.detach()} | info
         target_updater.step()
         report(1)
         if update % config.log_interval == 0:
             metrics.pop("td_error", None)  # one number per transition
-            check_finite(metrics, f"bcq {task}, update {update}")
+            check_finite(metrics, f"bcq {name}, update {update}")
             log_metrics(logger, metrics, update)
         if update % settings.updates_per_epoch == 0:
             epoch = update // settings.updates_per_epoch
@@ -109,7 +122,7 @@ def train_task(job: tuple[Config, str], report: Report) -> None:
         if update % config.checkpoint_interval == 0 or update == total:
             state = {
                 "loss": loss.state_dict(),
-                "optimizers": {name: o.state_dict() for name, o in optimizers.items()},
+                "optimizers": {network: o.state_dict() for network, o in optimizers.items()},
                 "rng": torch.get_rng_state(),
             }
             metadata = {
@@ -118,7 +131,7 @@ def train_task(job: tuple[Config, str], report: Report) -> None:
                 "loss": options,
                 "updates": update,
                 "evaluations": evaluations,
-                "statistics": {name: x.tolist() for name, x in vars(statistics).items()},
+                "statistics": {key: x.tolist() for key, x in vars(statistics).items()},
             }
             save_checkpoint(path, state, metadata)
 

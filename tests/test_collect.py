@@ -15,7 +15,8 @@ pytest.importorskip("h5py")
 
 import h5py
 
-from torchrl_bmrl.data.robomimic import read_demonstrations, read_episode
+from torchrl_bmrl.data.episodes import Episode
+from torchrl_bmrl.data.robomimic import open_episodes, read_kept_episode
 from torchrl_bmrl.data.schema import OBSERVATION_SHAPES
 from torchrl_bmrl.errors import DataError, UnknownNameError
 from torchrl_bmrl.experts import collect
@@ -55,6 +56,11 @@ def run(
     return collect_demonstrations(
         directory, episodes, valid_episodes=1, noise=0.2, seed=seed, workers=workers
     )
+
+
+def read(path: Path) -> list[Episode]:
+    with open_episodes(path) as episodes:
+        return list(episodes.values())
 
 
 def files(directory: Path) -> list[str]:
@@ -97,7 +103,7 @@ def test_the_file_has_the_layout_of_robomimic(collected: dict[str, Path]) -> Non
 
 
 def test_the_episodes_start_differently(collected: dict[str, Path]) -> None:
-    goals = [demo["obs"]["goal_pos"][0] for demo in read_demonstrations(collected["reach"])]
+    goals = [demo.observations["goal_pos"][0] for demo in read(collected["reach"])]
     assert len(np.unique(np.round(goals, 6), axis=0)) == 3
 
 
@@ -106,7 +112,7 @@ def test_a_stored_seed_reproduces_its_episode(collected: dict[str, Path]) -> Non
         demo = file["data/demo_1"]
         again = collect_episode("lift", int(demo.attrs["seed"]), noise=0.2, gains=ExpertGains())
         np.testing.assert_array_equal(again.actions, demo["actions"][:])
-        np.testing.assert_array_equal(again.states[:-1], demo["states"][:])
+        np.testing.assert_array_equal(again.extras["states"], demo["states"][:])
         np.testing.assert_array_equal(again.rewards, demo["rewards"][:])
 
 
@@ -128,16 +134,16 @@ def test_episodes_do_not_depend_on_how_many_are_asked_for(
     tmp_path: Path, collected: dict[str, Path]
 ) -> None:
     more = run(tmp_path, {"reach": 4})
-    first, longer = (read_demonstrations(path) for path in (collected["reach"], more["reach"]))
+    first, longer = (read(path) for path in (collected["reach"], more["reach"]))
     for ours, theirs in zip(first, longer, strict=False):
-        np.testing.assert_array_equal(ours["actions"], theirs["actions"])
+        np.testing.assert_array_equal(ours.actions, theirs.actions)
     assert len(longer) == 5
 
 
 def test_another_seed_gives_other_episodes(tmp_path: Path, collected: dict[str, Path]) -> None:
     other = run(tmp_path, {"lift": 1}, seed=4)["lift"]
-    ours, theirs = (read_demonstrations(path)[0] for path in (collected["lift"], other))
-    assert not np.array_equal(ours["actions"], theirs["actions"])
+    ours, theirs = (read(path)[0] for path in (collected["lift"], other))
+    assert not np.array_equal(ours.actions, theirs.actions)
 
 
 def test_what_was_finished_before_a_kill_is_kept_and_not_redone(
@@ -157,7 +163,7 @@ def test_what_was_finished_before_a_kill_is_kept_and_not_redone(
     kept = files(tmp_path)
     assert kept == [f".episodes/reach/0000{i}.npz" for i in range(3)]
     for name in kept:
-        assert len(read_episode(tmp_path / name).actions) == HORIZON
+        assert len(read_kept_episode(tmp_path / name)) == HORIZON
     times = {name: (tmp_path / name).stat().st_mtime_ns for name in kept}
     (tmp_path / ".episodes" / "reach" / ".00003.npz.0123.tmp").write_text("half of an epis")
 
@@ -199,16 +205,16 @@ def test_a_file_with_another_number_of_episodes_is_refused(collected: dict[str, 
 def test_fewer_episodes_than_a_killed_run_had_finished_are_enough(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = collect.write_demonstrations
+    real = collect.write_episodes
 
     def killed(*args: object, **options: object) -> None:
         raise Killed
 
-    monkeypatch.setattr(collect, "write_demonstrations", killed)
+    monkeypatch.setattr(collect, "write_episodes", killed)
     with pytest.raises(Killed):
         run(tmp_path, {"lift": 2})
-    monkeypatch.setattr(collect, "write_demonstrations", real)
-    assert len(read_demonstrations(run(tmp_path, {"lift": 1})["lift"])) == 2
+    monkeypatch.setattr(collect, "write_episodes", real)
+    assert len(read(run(tmp_path, {"lift": 1})["lift"])) == 2
 
 
 def test_an_unknown_task_is_refused_before_anything_is_written(tmp_path: Path) -> None:

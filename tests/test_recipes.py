@@ -490,3 +490,67 @@ def test_damaged_demonstrations_stop_training_before_anything_is_written(
     assert message.startswith(f"error: {path}: ")
     assert says in message
     assert not (tmp_path / "bcq").exists()
+
+
+# -- human demonstrations --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        ([], "error: human.path is empty; valid: a robosuite demo.hdf5"),
+        (["human.path=nowhere.hdf5"], "error: nowhere.hdf5: no such file"),
+        (["human.path=a", "human.shares=[0.1]"], "error: human.shares is [0.1]; valid: 0 and"),
+        (["human.path=a", "human.shares=[0,1.5]"], "error: human.shares is [0.0, 1.5]; valid"),
+        (["human.path=a", "human.tracking=0"], "error: human.tracking is 0.0; valid: above 0"),
+    ],
+)
+def test_learning_from_people_names_what_is_missing(
+    tmp_path: Path, overrides: list[str], says: str
+) -> None:
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    done = recipe("learn_from_people", "preset=smoke", "run_dir=run", *overrides, cwd=tmp_path)
+    assert done.returncode == 1
+    assert says in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_learning_from_people_compares_every_share_and_goes_on(
+    run: Run,
+    finished: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    import learn_from_people
+
+    # Any file in robomimic's layout with the task's observation may stand for people's.
+    options = [
+        f"human.path={finished / 'data' / 'lift.hdf5'}",
+        "human.shares=[0,1]",
+        "human.training_seeds=1",
+        "evaluate.episodes=2",
+    ]
+    run(tmp_path, learn_from_people.learn_from_people, *options)
+    table = (tmp_path / "tables" / "human.md").read_text()
+    assert [line.split("|")[1].strip() for line in table.splitlines()[2:]] == ["0%", "100%"]
+    assert "0 of 2" in table
+    assert "too few episodes" in table
+    assert table in capsys.readouterr().out
+    with (tmp_path / "human.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["share"] for row in rows] == ["0.0", "0.0", "1.0", "1.0"]
+    before = times(tmp_path)
+    run(tmp_path, learn_from_people.learn_from_people, *options)
+    assert times(tmp_path) == before
+
+    # What the agents trained on: ten scripted transitions, then the human ones.
+    buffers: list[Any] = []
+    monkeypatch.setattr(learn_from_people, "train_agent", lambda *given: buffers.append(given[3]))
+    config = OmegaConf.to_object(configured(*SMALL, f"run_dir={tmp_path}"))
+    for share in (0.0, 1.0):
+        learn_from_people.train_job((config, share, 0), lambda _: None)
+    scripted, human = (buffer.sample()["index"] for buffer in buffers)
+    assert scripted.max() < HORIZON <= human.min()

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import Composite, Unbounded
 
-from torchrl_bmrl.data.replay import stack_episodes
+from torchrl_bmrl.data.episodes import Episode, stack_episodes
 from torchrl_bmrl.envs.transforms import (
     OBSERVATION_PARTS,
     ObservationStatistics,
@@ -31,20 +31,22 @@ SIZES = {
 }
 
 
-def random_episodes(count: int, *, seed: int, loc: float = 0.0, scale: float = 1.0) -> list[dict]:
+def random_episodes(
+    count: int, *, seed: int, loc: float = 0.0, scale: float = 1.0
+) -> list[Episode]:
     rng = np.random.default_rng(seed)
 
     def parts() -> dict[str, np.ndarray]:
         return {name: loc + scale * rng.standard_normal((6, size)) for name, size in SIZES.items()}
 
     return [
-        {
-            "obs": parts(),
-            "next_obs": parts(),
-            "actions": rng.uniform(-1, 1, (6, 7)).astype(np.float32),
-            "rewards": np.zeros(6),
-            "successes": np.zeros(6, bool),
-        }
+        Episode(
+            observations=parts(),
+            next_observations=parts(),
+            actions=rng.uniform(-1, 1, (6, 7)).astype(np.float32),
+            rewards=np.zeros(6),
+            terminated=np.zeros(6, bool),
+        )
         for _ in range(count)
     ]
 
@@ -90,7 +92,7 @@ def test_observation_is_33_numbers_in_the_documented_order() -> None:
     (episode,) = random_episodes(1, seed=0)
     data = stack_episodes([episode], task=0)
     out = make_observation_transform()(data.copy())
-    expected = torch.as_tensor(raw_observation(episode["obs"])).float()
+    expected = torch.as_tensor(raw_observation(episode.observations)).float()
     assert out["observation"].shape == (6, 33)
     torch.testing.assert_close(out["observation"], expected)
     assert not set(SIZES) & set(out.keys())
@@ -102,11 +104,11 @@ def test_stored_transitions_are_normalised_now_and_next() -> None:
     data = stack_episodes([episode], task=3)
     kept = data.clone()
     out = transform_data(data, statistics)
-    for observation, group in (
-        (out["observation"], "obs"),
-        (out["next", "observation"], "next_obs"),
+    for observation, parts in (
+        (out["observation"], episode.observations),
+        (out["next", "observation"], episode.next_observations),
     ):
-        raw = torch.as_tensor(raw_observation(episode[group])).float()
+        raw = torch.as_tensor(raw_observation(parts)).float()
         torch.testing.assert_close(observation, (raw - statistics.loc) / statistics.scale)
         assert observation.dtype == torch.float32
     for key in ("action", "task", "step", ("next", "reward"), ("next", "truncated")):
@@ -170,13 +172,13 @@ def test_data_and_environment_give_the_same_observation_for_the_same_episode() -
         rewards.append(reward)
     env.close()
     stacked = {name: np.stack([parts[name] for parts in shown]) for name in SIZES}
-    episode = {
-        "obs": {name: part[:-1] for name, part in stacked.items()},
-        "next_obs": {name: part[1:] for name, part in stacked.items()},
-        "actions": actions,
-        "rewards": np.array(rewards),
-        "successes": np.zeros(8, bool),
-    }
+    episode = Episode(
+        observations={name: part[:-1] for name, part in stacked.items()},
+        next_observations={name: part[1:] for name, part in stacked.items()},
+        actions=actions,
+        rewards=np.array(rewards),
+        terminated=np.zeros(8, bool),
+    )
     stored = transform_data(stack_episodes([episode], task=0), statistics)
 
     env = make_env("push_left", statistics)

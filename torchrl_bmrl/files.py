@@ -5,11 +5,14 @@ from __future__ import annotations
 import csv
 import io
 import os
+import shutil
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from torchrl_bmrl.errors import DataError
 
 
 @contextmanager
@@ -65,6 +68,44 @@ def write_atomic(path: str | os.PathLike[str], data: str | bytes) -> None:
     """
     with atomic_path(path) as temporary:
         temporary.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
+
+
+@contextmanager
+def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yields a temporary folder that becomes ``path`` when the block succeeds.
+
+    It lies beside ``path``, has a leading dot and is removed if the block raises.
+
+    Args:
+        path: must not exist; its parents are created.
+
+    Raises:
+        DataError: if ``path`` exists.
+
+    Example:
+        >>> import tempfile
+        >>> target = Path(tempfile.mkdtemp()) / "new"
+        >>> with new_folder(target) as temporary:
+        ...     _ = (temporary / "a.txt").write_text("1")
+        >>> [file.name for file in target.iterdir()]
+        ['a.txt']
+    """
+    path = Path(path)
+    if os.path.lexists(path):
+        raise DataError(path, None, "exists already; valid: a new folder")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
+    try:
+        temporary.mkdir()
+        yield temporary
+        for file in filter(Path.is_file, temporary.rglob("*")):
+            with file.open("r+b") as written:
+                # Without it a power cut after the rename may leave empty files in the folder.
+                os.fsync(written.fileno())
+        temporary.rename(path)
+    except BaseException:  # an interrupt must not leave the temporary folder either
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
 
 
 def write_rows(path: str | os.PathLike[str], rows: Sequence[Mapping[str, Any]]) -> None:

@@ -1,13 +1,21 @@
-"""Demonstrations: files, checks, replay buffers."""
+"""Demonstrations: episodes, files, checks, replay buffers."""
 
+from torchrl.data.datasets import register_dataset
+
+from torchrl_bmrl.data.episodes import Episode, stack_episodes
 from torchrl_bmrl.data.replay import (
+    make_mixed_replay_buffer,
     make_multi_task_replay_buffer,
     make_replay_buffer,
-    stack_episodes,
     with_previous,
 )
 
+# By name: the class is imported when it is asked for, since it needs h5py.
+register_dataset("robomimic", "torchrl_bmrl.data.datasets:RobomimicExperienceReplay", replace=True)
+
 __all__ = [
+    "Episode",
+    "make_mixed_replay_buffer",
     "make_multi_task_replay_buffer",
     "make_replay_buffer",
     "stack_episodes",

@@ -1,4 +1,4 @@
-"""From demonstration files to what trains: checked, normalised transitions."""
+"""From the demonstrations of a run folder to what trains: checked, normalised transitions."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_bmrl.data.replay import stack_episodes
-from torchrl_bmrl.data.robomimic import read_demonstrations
+from torchrl_bmrl.data.datasets import RobomimicExperienceReplay
+from torchrl_bmrl.data.schema import ACTION_DIM, OBSERVATION_SHAPES
 from torchrl_bmrl.envs.transforms import ObservationStatistics, transform_data
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.files import write_atomic
@@ -22,35 +22,82 @@ def demonstration_path(data_dir: Path, task: str) -> Path:
     return data_dir / f"{check_task(task)}.hdf5"
 
 
+def read_demonstrations(path: Path, *, split: str | None = None, num_task: int) -> TensorDictBase:
+    """Demonstrations of one of the six tasks as they were recorded.
+
+    Args:
+        path: a file in robomimic's layout; converted once, beside it.
+        split: ``"train"``, ``"valid"`` or ``None`` for all.
+        num_task: class index y.
+
+    Returns:
+        batch ``[N]`` with the keys of
+        :class:`~torchrl_bmrl.data.datasets.RobomimicExperienceReplay` and ``task``.
+
+    Raises:
+        DataError: naming file and key, for what that class refuses, and for parts of the
+            observation or actions that are not the six tasks', missing ``successes``, or an episode
+            that terminates: these tasks end at their horizon, which truncates.
+    """
+    replay = RobomimicExperienceReplay(path, split=split, observation_keys=OBSERVATION_SHAPES)
+    data = replay[:].copy()
+    for key, size in {**OBSERVATION_SHAPES, "action": ACTION_DIM}.items():
+        if data[key].shape[1:] != (size,):
+            raise DataError(path, key, f"shape {tuple(data[key].shape)}; valid: (N, {size})")
+    if data.get(("next", "success"), None) is None:
+        raise DataError(path, "data", "no successes; valid: successes (T,) in every demonstration")
+    if data["next", "terminated"].any():
+        raise DataError(path, "terminated", "an episode terminates; valid: none, horizons truncate")
+    return data.set("task", torch.full((len(data),), num_task))
+
+
 def write_statistics(data_dir: Path, tasks: Iterable[str]) -> ObservationStatistics:
-    """Statistics over the training demonstrations of all tasks, kept in ``statistics.json``."""
-    raw = [
-        stack_episodes(
-            read_demonstrations(demonstration_path(data_dir, task), split="train"),
-            task=TASKS.index(task),
+    """Statistics of the training demonstrations, kept in ``statistics.json``.
+
+    Those over all tasks together (``loc`` and ``scale``) normalise; those of each task are under
+    ``tasks``.
+    """
+    raw = {
+        task: read_demonstrations(
+            demonstration_path(data_dir, task), split="train", num_task=TASKS.index(task)
         )
         for task in tasks
-    ]
-    statistics = ObservationStatistics.of(raw)
-    text = json.dumps({"loc": statistics.loc.tolist(), "scale": statistics.scale.tolist()})
-    write_atomic(data_dir / "statistics.json", text + "\n")
+    }
+    statistics = ObservationStatistics.of(list(raw.values()))
+    content = _plain(statistics) | {
+        "tasks": {
+            task: _plain(ObservationStatistics.of([data])) | {"transitions": len(data)}
+            for task, data in raw.items()
+        }
+    }
+    write_atomic(data_dir / "statistics.json", json.dumps(content) + "\n")
     return statistics
 
 
-def read_statistics(data_dir: Path) -> ObservationStatistics:
+def _plain(statistics: ObservationStatistics) -> dict[str, object]:
+    return {"loc": statistics.loc.tolist(), "scale": statistics.scale.tolist()}
+
+
+def read_statistics(data_dir: Path, task: str | None = None) -> ObservationStatistics:
     """Reads what :func:`write_statistics` wrote.
 
+    Args:
+        data_dir: folder of the demonstrations.
+        task: whose statistics; ``None`` for those over all tasks.
+
     Raises:
-        DataError: if the file is missing or damaged.
+        DataError: if the file is missing or damaged, or knows nothing of the task.
     """
     path = data_dir / "statistics.json"
     if not path.is_file():
         raise DataError(path, None, "no such file; recipes/collect.py writes it")
     try:
         content = json.loads(path.read_text())
+        if task is not None:
+            content = content["tasks"][task]
         loc, scale = torch.tensor(content["loc"]), torch.tensor(content["scale"])
     except (ValueError, KeyError, TypeError) as error:
-        raise DataError(path, None, f"not the statistics of a data set ({error})") from error
+        raise DataError(path, task, f"not the statistics of a data set ({error})") from error
     if loc.shape != scale.shape or loc.ndim != 1 or not (scale > 0).all():
         raise DataError(path, "scale", "valid: as many positive numbers as in loc")
     return ObservationStatistics(loc, scale)
@@ -69,8 +116,7 @@ def load_transitions(
         num_task: class index y.
 
     Returns:
-        batch ``[N]`` with ``observation (33,)`` and the keys of
-        :func:`~torchrl_bmrl.data.stack_episodes`.
+        batch ``[N]`` with ``observation (33,)`` and the keys of :func:`read_demonstrations`.
     """
-    episodes = read_demonstrations(demonstration_path(data_dir, task), split=split)
-    return transform_data(stack_episodes(episodes, task=num_task), statistics)
+    raw = read_demonstrations(demonstration_path(data_dir, task), split=split, num_task=num_task)
+    return transform_data(raw, statistics)

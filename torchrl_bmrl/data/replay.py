@@ -1,93 +1,26 @@
-"""Demonstrations as TensorDicts, and replay buffers over one task or all of them."""
+"""Replay buffers over the data of one task, of several, or of a mixture of data sets.
+
+The data lie one after the other in one storage: a memory map, or the training device's memory where
+they fit. A :class:`~torchrl_bmrl.data.sampler.TaskSampler` draws from them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from functools import partial
+from math import isfinite
 from typing import Any
 
-import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
-from torchrl.data import (
-    LazyMemmapStorage,
-    ReplayBufferEnsemble,
-    TensorDictReplayBuffer,
-)
-from torchrl.data.replay_buffers.samplers import RandomSampler, SamplerEnsemble
-from torchrl.data.replay_buffers.storages import StorageEnsemble
-from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter, WriterEnsemble
+from tensordict import TensorDictBase
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
 
-from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.data.sampler import DatasetBuffer, Device, MemmapStorage, TaskSampler
+from torchrl_bmrl.errors import BMRLError, ConfigError
 
-
-def stack_episodes(episodes: Sequence[Mapping[str, Any]], *, task: int) -> TensorDict:
-    """Episodes one after the other, in TorchRL's layout.
-
-    The last step of an episode is ``truncated``, never ``terminated``: the horizon ends it, and its
-    value bootstraps through.
-
-    Args:
-        episodes: dicts with ``obs`` and ``next_obs`` (dicts of ``(T, n)``), ``actions (T, a)``,
-            ``rewards (T,)`` and ``successes (T,)``, as
-            :func:`torchrl_bmrl.data.robomimic.read_demonstrations` returns them.
-        task: class index written to ``task``.
-
-    Returns:
-        batch ``[N]``: the named parts of the observation and the same under ``"next"`` (float64),
-        ``action``, ``("next", "reward")``, ``("next", "done")``, ``("next", "terminated")``,
-        ``("next", "truncated")``, ``("next", "success")`` each ``(N, 1)``, and ``task``,
-        ``episode``, ``step`` ``(N,)`` int64.
-
-    Raises:
-        BMRLError: without episodes.
-
-    Example:
-        >>> part = np.zeros((5, 3))
-        >>> episode = {
-        ...     "obs": {"x": part},
-        ...     "next_obs": {"x": part},
-        ...     "actions": np.zeros((5, 2)),
-        ...     "rewards": np.zeros(5),
-        ...     "successes": np.zeros(5, bool),
-        ... }
-        >>> data = stack_episodes([episode, episode], task=1)
-        >>> data.batch_size, data["next", "truncated"].sum().item()
-        (torch.Size([10]), 2)
-    """
-    if not episodes:
-        raise BMRLError("no episodes; valid: at least one")
-
-    def column(name: str) -> Tensor:
-        return torch.as_tensor(np.concatenate([episode[name] for episode in episodes]))
-
-    def parts(group: str) -> dict[str, Tensor]:
-        return {
-            name: torch.as_tensor(np.concatenate([episode[group][name] for episode in episodes]))
-            for name in episodes[0][group]
-        }
-
-    lengths = [len(episode["actions"]) for episode in episodes]
-    step = torch.cat([torch.arange(length) for length in lengths])
-    last = torch.cat([torch.arange(length) == length - 1 for length in lengths]).unsqueeze(-1)
-    return TensorDict(
-        {
-            **parts("obs"),
-            "action": column("actions").float(),
-            "task": torch.full_like(step, task),
-            "episode": torch.repeat_interleave(torch.arange(len(lengths)), torch.tensor(lengths)),
-            "step": step,
-            "next": {
-                **parts("next_obs"),
-                "reward": column("rewards").float().unsqueeze(-1),
-                "done": last,
-                "terminated": torch.zeros_like(last),
-                "truncated": last.clone(),
-                "success": column("successes").bool().unsqueeze(-1),
-            },
-        },
-        batch_size=[len(step)],
-    )
+PREFETCH = 2
+"""Samples prepared ahead where every sample is transferred to the device."""
 
 
 def with_previous(data: TensorDictBase, keys: Sequence[Any]) -> TensorDictBase:
@@ -100,6 +33,7 @@ def with_previous(data: TensorDictBase, keys: Sequence[Any]) -> TensorDictBase:
         keys: the keys of a transition to copy.
 
     Example:
+        >>> from tensordict import TensorDict
         >>> data = TensorDict({"step": torch.tensor([0, 1, 0]), "x": torch.arange(3)}, [3])
         >>> with_previous(data, ["x"])["previous", "x"]
         tensor([0, 0, 2])
@@ -109,56 +43,241 @@ def with_previous(data: TensorDictBase, keys: Sequence[Any]) -> TensorDictBase:
 
 
 def make_replay_buffer(
-    data: TensorDictBase, *, batch_size: int, scratch_dir: str | None = None
+    data: TensorDictBase,
+    *,
+    batch_size: int,
+    device: Device = None,
+    prefetch: int | None = None,
+    scratch_dir: str | None = None,
 ) -> TensorDictReplayBuffer:
-    """Memory-mapped buffer that samples single transitions with replacement.
+    """Buffer that samples single transitions with replacement.
 
     Args:
-        data: batch ``[N]``.
+        data: batch ``[N]``; copied once.
         batch_size: transitions a sample.
-        scratch_dir: where the memory map lies; a temporary folder by default.
+        device: where samples come from, as in :func:`make_multi_task_replay_buffer`.
+        prefetch: samples prepared ahead, as there.
+        scratch_dir: where a memory map lies; a temporary folder by default.
+
+    Returns:
+        a buffer of samples ``[batch_size]`` with the keys of the data and ``index``.
 
     Raises:
-        BMRLError: for numbers that are not finite. Losses look for them on CPU only: elsewhere
-            that would wait for the device.
+        BMRLError: without data, or for numbers that are not finite. Losses look for them on CPU
+            only: elsewhere that would wait for the device.
+        ConfigError: for invalid options.
 
     Example:
+        >>> from tensordict import TensorDict
         >>> buffer = make_replay_buffer(TensorDict({"x": torch.arange(10)}, [10]), batch_size=4)
         >>> buffer.sample().batch_size
         torch.Size([4])
     """
-    for key, value in data.items(include_nested=True, leaves_only=True):
-        if value.is_floating_point() and not value.isfinite().all():
-            row = int((~value.isfinite()).nonzero()[0, 0])
-            raise BMRLError(f"{key!r} is not finite in transition {row}; valid: finite numbers")
-    buffer = TensorDictReplayBuffer(
-        storage=LazyMemmapStorage(len(data), scratch_dir=scratch_dir), batch_size=batch_size
-    )
-    buffer.extend(data)
-    return buffer
+    _check_data(data, "the data")
+    return _make_buffer([data], None, True, batch_size, device, prefetch, scratch_dir)
 
 
 def make_multi_task_replay_buffer(
-    datasets: Sequence[TensorDictBase], *, batch_size: int
-) -> ReplayBufferEnsemble:
-    """Buffer whose every sample holds ``batch_size`` transitions of every task.
+    datasets: Sequence[TensorDictBase],
+    *,
+    batch_size: int,
+    weights: Sequence[float] | None = None,
+    device: Device = None,
+    prefetch: int | None = None,
+    scratch_dir: str | None = None,
+) -> TensorDictReplayBuffer:
+    """Buffer whose every sample has one row of ``batch_size`` transitions per task.
+
+    On another device than the CPU the data lie there if they take at most half of its free memory
+    (:func:`fits`); else they are a memory map, and threads prepare samples ahead and transfer them
+    from pinned memory.
+
+    Draws follow ``torch.manual_seed``. With ``prefetch`` they follow a generator of the buffer's
+    own, seeded by torch's when the buffer is made, since threads draw whenever they run. Equal
+    seeds still give equal samples with ``prefetch=1``; more threads may hand them on in another
+    order.
 
     Args:
-        datasets: one batch ``[N_i]`` per task, in the order of the tasks.
-        batch_size: transitions a task and sample.
+        datasets: one batch ``[N_i]`` per task, in the order of the tasks, with equal keys, shapes
+            and dtypes; copied once.
+        batch_size: transitions a row.
+        weights: without them, row i is of task i. With them, one positive number per task, each
+            row is of a task drawn in their proportion, with replacement: a sample may have two rows
+            of one task and none of another, and ``task`` in the data says whose a row is.
+        device: where samples come from; the CPU by default.
+        prefetch: samples prepared ahead, by as many threads; by default two where samples are
+            transferred, none elsewhere.
+        scratch_dir: where a memory map lies; a temporary folder by default.
 
     Returns:
-        a buffer whose samples have the batch size ``[num_tasks, batch_size]``, row i of task i.
+        a buffer of samples ``[num_tasks, batch_size]`` with the keys of the data and ``index``. Its
+        ``loads`` takes what its ``dumps`` wrote, for data sets of the same sizes.
+
+    Raises:
+        BMRLError: without data sets; for one that is empty, differs from the first in a key, shape
+            or dtype, or has a number that is not finite.
+        ConfigError: for invalid options.
 
     Example:
+        >>> from tensordict import TensorDict
         >>> tasks = [TensorDict({"task": torch.full((10,), i)}, [10]) for i in range(3)]
         >>> make_multi_task_replay_buffer(tasks, batch_size=2).sample()["task"].tolist()
         [[0, 0], [1, 1], [2, 2]]
     """
-    buffers = [make_replay_buffer(data, batch_size=batch_size) for data in datasets]
-    return ReplayBufferEnsemble(
-        storages=StorageEnsemble(*(buffer.storage for buffer in buffers), transforms=None),
-        samplers=SamplerEnsemble(*(RandomSampler() for _ in buffers), sample_from_all=True),
-        writers=WriterEnsemble(*(ImmutableDatasetWriter() for _ in buffers)),
-        batch_size=batch_size * len(buffers),
+    datasets = _check_datasets(datasets)
+    if weights is not None:
+        weights = _check_weights(weights, len(datasets), zero=False)
+    return _make_buffer(datasets, weights, False, batch_size, device, prefetch, scratch_dir)
+
+
+def make_mixed_replay_buffer(
+    datasets: Sequence[TensorDictBase],
+    *,
+    weights: Sequence[float],
+    batch_size: int,
+    device: Device = None,
+    prefetch: int | None = None,
+    scratch_dir: str | None = None,
+) -> TensorDictReplayBuffer:
+    """Buffer over a mixture of data sets, such as scripted and human demonstrations of one task.
+
+    Args:
+        datasets: batches ``[N_i]`` with equal keys, shapes and dtypes; copied once.
+        weights: one number per data set, none negative: a transition is of data set i with the
+            probability ``weights[i] / sum(weights)``, however large the data set is.
+        batch_size: transitions a sample.
+        device: where samples come from, as in :func:`make_multi_task_replay_buffer`.
+        prefetch: samples prepared ahead, as there.
+        scratch_dir: where a memory map lies; a temporary folder by default.
+
+    Returns:
+        a buffer of samples ``[batch_size]`` with the keys of the data and ``index``.
+
+    Raises:
+        BMRLError: for the data sets that :func:`make_multi_task_replay_buffer` refuses.
+        ConfigError: for invalid options.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> few, many = (TensorDict({"x": torch.full((n,), n)}, [n]) for n in (1, 1000))
+        >>> buffer = make_mixed_replay_buffer([few, many], weights=[1, 0], batch_size=3)
+        >>> buffer.sample()["x"].tolist()
+        [1, 1, 1]
+    """
+    datasets = _check_datasets(datasets)
+    weights = _check_weights(weights, len(datasets), zero=True)
+    return _make_buffer(datasets, weights, True, batch_size, device, prefetch, scratch_dir)
+
+
+def fits(datasets: Sequence[TensorDictBase], device: torch.device) -> bool:
+    """Whether data take at most half of a CUDA device's free memory; no other device is asked.
+
+    Example:
+        >>> fits([], torch.device("cpu"))
+        False
+    """
+    if device.type != "cuda":
+        return False
+    return sum(data.bytes() for data in datasets) <= torch.cuda.mem_get_info(device)[0] / 2
+
+
+def _make_buffer(
+    datasets: Sequence[TensorDictBase],
+    weights: Sequence[float] | None,
+    flat: bool,
+    batch_size: int,
+    device: Device,
+    prefetch: int | None,
+    scratch_dir: str | None,
+) -> TensorDictReplayBuffer:
+    target = _check_device(device)
+    sizes = [len(data) for data in datasets]
+    if target.type != "cpu" and fits(datasets, target):
+        storage = LazyTensorStorage(sum(sizes), device=target)
+    else:
+        storage = MemmapStorage(sum(sizes), scratch_dir=scratch_dir)
+    transferred = storage.device != target
+    prefetch = PREFETCH * transferred if prefetch is None else prefetch
+    _check_count("batch_size", batch_size, 1)
+    _check_count("prefetch", prefetch, 0)
+    end = 0
+    for data in datasets:
+        start, end = end, end + len(data)
+        storage.set(slice(start, end), data)
+    return DatasetBuffer(
+        storage=storage,
+        sampler=TaskSampler(sizes, weights=weights, flat=flat, device=storage.device),
+        writer=ImmutableDatasetWriter(),
+        batch_size=batch_size,
+        transform=partial(_transfer, device=target) if transferred else None,
+        prefetch=prefetch,
+        generator=_own_generator(storage.device) if prefetch else None,
     )
+
+
+def _transfer(data: TensorDictBase, device: torch.device) -> TensorDictBase:
+    if device.type != "cuda":
+        return data.to(device)
+    return data.pin_memory(num_threads=0).to(device, non_blocking=True)
+
+
+def _own_generator(device: torch.device) -> torch.Generator:
+    seed = torch.randint(2**62, ()).item()
+    return torch.Generator(device=device).manual_seed(int(seed))
+
+
+def _check_count(name: str, value: Any, least: int) -> None:
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        raise ConfigError(f"{name} is {value!r}; valid: at least {least}, an integer")
+
+
+def _check_device(device: Device) -> torch.device:
+    try:
+        return torch.empty(0, device="cpu" if device is None else device).device
+    except (AssertionError, RuntimeError, TypeError) as error:
+        raise ConfigError(
+            f"device is {device!r}; valid: one that torch can use ({error})"
+        ) from error
+
+
+def _check_weights(weights: Sequence[float], count: int, *, zero: bool) -> list[float]:
+    values = [float(weight) for weight in weights]
+    in_range = all(isfinite(x) and (x >= 0 if zero else x > 0) for x in values)
+    if len(values) != count or not in_range or not any(values):
+        kind = "none negative, one positive" if zero else "all positive"
+        message = f"weights is {values}; valid: {count} finite numbers, one per data set, {kind}"
+        raise ConfigError(message)
+    return [value / max(values) for value in values]
+
+
+def _check_datasets(datasets: Sequence[TensorDictBase]) -> list[TensorDictBase]:
+    datasets = list(datasets)
+    if not datasets:
+        raise BMRLError("no data sets; valid: at least one")
+    for number, data in enumerate(datasets):
+        _check_data(data, f"data set {number}")
+        given, expected = _layout(data), _layout(datasets[0])
+        for key in [*expected, *given]:
+            if given.get(key) != expected.get(key):
+                raise BMRLError(
+                    f"data set {number}: {key!r} is {given.get(key, 'missing')}, in data set 0 "
+                    f"{expected.get(key, 'missing')}; valid: equal keys, shapes and dtypes"
+                )
+    return datasets
+
+
+def _check_data(data: TensorDictBase, name: str) -> None:
+    if data.batch_dims != 1 or not len(data):
+        size = list(data.batch_size)
+        raise BMRLError(f"{name}: batch size {size}; valid: [N] with at least one transition")
+    for key, value in data.items(include_nested=True, leaves_only=True):
+        if value.is_floating_point() and not value.isfinite().all():
+            row = int((~value.isfinite()).nonzero()[0, 0])
+            message = f"{key!r} is not finite in transition {row}; valid: finite numbers"
+            raise BMRLError(f"{name}: {message}")
+
+
+def _layout(data: TensorDictBase) -> dict[Any, str]:
+    """Dtype and shape of a transition by key."""
+    items = data.items(include_nested=True, leaves_only=True)
+    return {key: f"{value.dtype} {tuple(value.shape[1:])}" for key, value in items}

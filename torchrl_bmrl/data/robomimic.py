@@ -1,230 +1,341 @@
-"""Demonstrations in robomimic's HDF5 layout: written, checked, read.
+"""Demonstrations in robomimic's HDF5 layout.
 
 Layout of a file::
 
     data                      attributes: total, env_args (JSON), and what the collector adds
-    data/demo_<i>             attributes: num_samples, seed
+    data/demo_<i>             attributes: num_samples, model_file, seed, ...
         obs/<name>, next_obs/<name>    (T, ...)
         actions               (T, action_dim) in [-1, 1]
-        rewards, dones        (T,)  dones: 1 at the last step, where the horizon truncates
-        successes             (T,)  the task's own definition
-        phases                (T,)  the expert's phase; attribute names
+        rewards, dones        (T,)  dones: 1 at the last step
+        terminated            (T,)  this library's: where no value follows; absent: nowhere
+        successes             (T,)  this library's: the task's own definition
         states                (T, n) the simulator's state before each action
     mask/train, mask/valid    names of demonstrations, bytes
+
+Whatever else has T rows is kept as it is.
 """
 
 from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
-from torchrl_bmrl.data.schema import OBSERVATION_SHAPES, check_episode
+from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
+from torchrl_bmrl.data.hdf5 import (
+    DAMAGE,
+    open_file,
+    read_array,
+    read_attributes,
+    read_names,
+    read_strings,
+)
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.files import atomic_path, write_atomic
 
-
-@dataclass(frozen=True, kw_only=True)
-class Episode:
-    """One episode of T steps.
-
-    Attributes:
-        observations: named parts, each ``(T + 1, ...)``: before each action and after the last.
-        actions: ``(T, action_dim)`` float32 in [-1, 1].
-        rewards: ``(T,)``.
-        successes: ``(T,)`` bool.
-        phases: ``(T,)`` int8, index into ``phase_names``.
-        states: simulator states, ``(T + 1, n)``.
-        seed: that reproduces the start.
-        phase_names: the expert's phases.
-    """
-
-    observations: dict[str, np.ndarray]
-    actions: np.ndarray
-    rewards: np.ndarray
-    successes: np.ndarray
-    phases: np.ndarray
-    states: np.ndarray
-    seed: int
-    phase_names: tuple[str, ...]
+STEP_KEYS = ("actions", "rewards", "dones", "terminated", "obs", "next_obs")
 
 
-def write_episode(path: Path, episode: Episode) -> None:
-    """Keeps one episode as an npz file, atomically."""
-    buffer = io.BytesIO()
-    np.savez(
-        buffer,
-        actions=episode.actions,
-        rewards=episode.rewards,
-        successes=episode.successes,
-        phases=episode.phases,
-        states=episode.states,
-        seed=np.array(episode.seed),
-        phase_names=np.array(episode.phase_names),
-        **{f"obs/{name}": part for name, part in episode.observations.items()},
-    )
-    write_atomic(path, buffer.getvalue())
-
-
-def read_episode(path: Path) -> Episode:
-    """Reads what :func:`write_episode` wrote."""
-    with np.load(path, allow_pickle=False) as file:
-        return Episode(
-            observations={
-                key.removeprefix("obs/"): file[key] for key in file if key.startswith("obs/")
-            },
-            actions=file["actions"],
-            rewards=file["rewards"],
-            successes=file["successes"],
-            phases=file["phases"],
-            states=file["states"],
-            seed=int(file["seed"]),
-            phase_names=tuple(str(name) for name in file["phase_names"]),
-        )
-
-
-def write_demonstrations(
-    path: Path,
-    episodes: Iterable[Episode],
+@contextmanager
+def open_episodes(
+    path: str | Path,
     *,
-    train_episodes: int,
-    env_args: Mapping[str, Any],
-    attributes: Mapping[str, str | int | float],
-) -> None:
-    """Writes a whole file, or leaves none.
+    split: str | None = None,
+    observation_keys: Iterable[str] | None = None,
+    extras: Iterable[str] | None = None,
+    dones_terminate: bool = False,
+) -> Iterator[Mapping[str, Episode]]:
+    """Episodes of a file by name, each read when it is asked for.
 
     Args:
-        path: the HDF5 file.
-        episodes: in order; the first ``train_episodes`` are ``mask/train``, the rest
-            ``mask/valid``.
-        train_episodes: how many train.
-        env_args: robomimic's environment metadata.
-        attributes: further attributes of ``data``.
+        path: the HDF5 file; it is only read.
+        split: name of a mask, such as ``"train"``; ``None`` for all.
+        observation_keys: parts of the observation to read; ``None`` for all.
+        extras: further arrays to read, those of them that are there; ``None`` for all.
+        dones_terminate: what ``dones`` means at the last step of files without ``terminated``:
+            robomimic's simulators never terminate, so that by default an episode's end truncates.
+
+    Raises:
+        DataError: naming file and key, for a missing or damaged file, a mask that is missing or
+            names a demonstration that is, and, when an episode is read, for missing keys.
+            Files without ``next_obs`` take the next step's ``obs`` and lose the last step.
     """
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-        data = file.create_group("data")
-        names: list[str] = []
-        total = 0
-        for i, episode in enumerate(episodes):
-            names.append(f"demo_{i}")
-            demo = data.create_group(names[-1])
-            steps = len(episode.actions)
-            total += steps
-            for name, part in episode.observations.items():
-                demo[f"obs/{name}"] = part[:-1]
-                demo[f"next_obs/{name}"] = part[1:]
-            demo["actions"] = episode.actions
-            demo["rewards"] = episode.rewards
-            dones = np.zeros(steps, dtype=np.int64)
-            dones[-1] = 1
-            demo["dones"] = dones
-            demo["successes"] = episode.successes
-            demo["phases"] = episode.phases
-            demo["phases"].attrs["names"] = list(episode.phase_names)
-            demo["states"] = episode.states[:-1]
-            demo.attrs["num_samples"] = steps
-            demo.attrs["seed"] = episode.seed
-        data.attrs["total"] = total
-        data.attrs["env_args"] = json.dumps(dict(env_args))
-        for name, value in attributes.items():
-            data.attrs[name] = value
-        file["mask/train"] = np.array(names[:train_episodes], dtype="S")
-        file["mask/valid"] = np.array(names[train_episodes:], dtype="S")
+    parts = None if observation_keys is None else list(observation_keys)
+    wanted = None if extras is None else set(extras)
+    with open_file(path) as file:
+
+        def read(name: str) -> Episode:
+            return _read_episode(path, file, f"data/{name}", parts, wanted, dones_terminate)
+
+        yield LazyEpisodes(episode_names(path, file, split), read)
 
 
-_DAMAGE = (OSError, RuntimeError, KeyError, TypeError, ValueError, MemoryError)
-"""What h5py raises on a damaged file, depending on where the damage is."""
+def episode_names(path: str | Path, file: h5py.File, split: str | None) -> list[str]:
+    """Names of all demonstrations, or of a mask's.
+
+    Raises:
+        DataError: if there are none, or the mask is missing or names one that is.
+    """
+    names = read_names(path, file, "data")
+    if split is not None:
+        masks = _read_masks(path, file)
+        if split not in masks:
+            valid = ", ".join(masks) or "none; the file has no masks"
+            raise DataError(path, f"mask/{split}", f"missing; valid masks: {valid}")
+        chosen = read_strings(path, file, f"mask/{split}")
+        for row, name in enumerate(chosen):
+            if name not in names or name in chosen[:row]:
+                fault = "again" if name in names else "which is not in the file"
+                message = f"row {row} names {name!r}, {fault}"
+                raise DataError(path, f"mask/{split}", message)
+        names = chosen
+    if not names:
+        raise DataError(path, f"mask/{split}" if split else "data", "no demonstrations")
+    return names
 
 
-def _open(path: Path) -> h5py.File:
-    if not Path(path).is_file():
-        raise DataError(path, None, "no such file; recipes/collect.py writes it")
+def _read_masks(path: str | Path, file: h5py.File) -> list[str]:
+    return read_names(path, file, "mask") if "mask" in read_names(path, file, "/") else []
+
+
+def _read_episode(
+    path: str | Path,
+    file: h5py.File,
+    demo: str,
+    parts: list[str] | None,
+    extras: set[str] | None,
+    dones_terminate: bool,
+) -> Episode:
+    present = read_names(path, file, demo)
+    if parts is None:
+        parts = read_names(path, file, f"{demo}/obs")
+    observations = {part: read_array(path, file, f"{demo}/obs/{part}") for part in parts}
+    actions = read_array(path, file, f"{demo}/actions")
+    wanted = [key for key in present if key not in STEP_KEYS and (extras is None or key in extras)]
+    steps: dict[str, np.ndarray] = {"actions": actions}
+    steps["rewards"] = read_array(path, file, f"{demo}/rewards")
+    if "terminated" in present:
+        steps["terminated"] = _read_flags(path, file, f"{demo}/terminated")
+    else:
+        steps["terminated"] = np.zeros(actions.shape[:1], dtype=bool)
+        if dones_terminate:
+            dones = _read_flags(path, file, f"{demo}/dones")
+            if dones.shape != actions.shape[:1]:
+                message = f"shape {dones.shape}; valid: {actions.shape[:1]}"
+                raise DataError(path, f"{demo}/dones", message)
+            # Some files mark every step at which the task is solved: the episode goes on there.
+            steps["terminated"][-1:] = dones[-1:]
+    steps |= {key: read_array(path, file, f"{demo}/{key}") for key in wanted}
+    if "next_obs" in present:
+        after = {part: read_array(path, file, f"{demo}/next_obs/{part}") for part in parts}
+    else:
+        after = {part: array[1:] for part, array in observations.items()}
+        observations = {part: array[:-1] for part, array in observations.items()}
+        steps = {key: array[:-1] for key, array in steps.items()}
+    return Episode(
+        observations=observations,
+        next_observations=after,
+        actions=steps.pop("actions"),
+        rewards=steps.pop("rewards"),
+        terminated=steps.pop("terminated"),
+        extras=steps,
+        attributes={
+            key: value
+            for key, value in read_attributes(path, file, demo).items()
+            if key != "num_samples"
+        },
+    )
+
+
+def _read_flags(path: str | Path, file: h5py.File, key: str) -> np.ndarray:
+    flags = read_array(path, file, key)
+    wrong = np.flatnonzero((flags != 0) & (flags != 1))
+    if len(wrong):
+        raise DataError(path, key, f"{flags.flat[wrong[0]]} in row {wrong[0]}; valid: 0 or 1")
+    return flags.astype(bool)
+
+
+def read_metadata(path: str | Path) -> dict[str, Any]:
+    """Attributes of a file, ``env_args`` parsed, and its masks.
+
+    Returns:
+        the attributes by name, and ``masks``: names of demonstrations by mask.
+
+    Raises:
+        DataError: if the file is missing or damaged, or ``env_args`` is not JSON.
+    """
+    with open_file(path) as file:
+        read_names(path, file, "data")
+        attributes = read_attributes(path, file, "data")
+        masks = _read_masks(path, file)
+        attributes["masks"] = {name: read_strings(path, file, f"mask/{name}") for name in masks}
     try:
-        return h5py.File(path, "r")
-    except _DAMAGE as error:
-        raise DataError(path, None, f"not a whole HDF5 file ({error})") from error
+        attributes["env_args"] = json.loads(attributes.get("env_args", "{}"))
+    except (TypeError, ValueError) as error:
+        raise DataError(path, "data", f"attribute env_args is not JSON ({error})") from error
+    return attributes
 
 
-def _names(path: Path, file: h5py.File) -> list[str]:
-    """Names of all demonstrations, ``demo_2`` before ``demo_10``."""
-    try:
-        data = file.get("data")
-        if isinstance(data, h5py.Group):
-            return sorted(data, key=lambda name: (len(name), name))
-    except _DAMAGE as error:
-        raise DataError(path, "data", f"unreadable ({error})") from error
-    raise DataError(path, "data", "missing; valid: a group that holds every demonstration")
-
-
-def _array(path: Path, file: h5py.File, key: str) -> np.ndarray:
-    try:
-        node = file.get(key)
-        if isinstance(node, h5py.Dataset):
-            return np.asarray(node[()])
-    except _DAMAGE as error:
-        raise DataError(path, key, f"unreadable ({error})") from error
-    raise DataError(path, key, "missing" if node is None else "a group; valid: a dataset")
-
-
-def count_episodes(path: Path) -> int:
+def count_episodes(path: str | Path) -> int:
     """Number of demonstrations in a file.
 
     Raises:
         DataError: if the file is missing, damaged or has no ``data`` group.
     """
-    with _open(path) as file:
-        return len(_names(path, file))
+    with open_file(path) as file:
+        return len(read_names(path, file, "data"))
 
 
-def read_demonstrations(
-    path: Path, *, split: str | None = None, observation_keys: Iterable[str] = OBSERVATION_SHAPES
-) -> list[dict[str, Any]]:
-    """Reads and checks the demonstrations of a file.
+def count_steps(path: str | Path, names: Iterable[str]) -> int:
+    """Steps of some demonstrations together, without reading them.
+
+    Raises:
+        DataError: if the file is damaged or lacks the actions of one.
+    """
+    total = 0
+    with open_file(path) as file:
+        for name in names:
+            key = f"data/{name}/actions"
+            try:
+                total += len(file[key]) - ("next_obs" not in file[f"data/{name}"])
+            except DAMAGE as error:
+                raise DataError(path, key, f"missing or unreadable ({error})") from error
+    return total
+
+
+def write_episodes(
+    path: str | Path,
+    episodes: Iterable[Episode],
+    *,
+    env_args: Mapping[str, Any],
+    attributes: Mapping[str, str | int | float] | None = None,
+    masks: Mapping[str, Iterable[int]] | None = None,
+) -> None:
+    """Writes a whole file, or leaves none.
+
+    Every array carries checksums, and so do names and shapes: damage is found when it is read.
 
     Args:
         path: the HDF5 file.
-        split: ``"train"``, ``"valid"`` or ``None`` for all.
-        observation_keys: parts of the observation to read.
-
-    Returns:
-        one dict per demonstration: ``name``, ``obs`` and ``next_obs`` (dicts of ``(T, n)``),
-        ``actions (T, 7)``, ``rewards (T,)``, ``successes (T,)``.
+        episodes: in order, named ``demo_0``, ``demo_1``, ...
+        env_args: robomimic's environment metadata: ``env_name``, ``type``, ``env_version`` and
+            ``env_kwargs``.
+        attributes: further attributes of ``data``.
+        masks: positions of the episodes of each mask, such as ``{"train": range(60)}``.
 
     Raises:
-        DataError: naming file and key, for a missing or damaged file, a missing key or mask, wrong
-            shapes, values that are not finite, or actions outside [-1, 1].
+        DataError: if an extra is named like one of the layout's own arrays.
     """
-    observation_keys = list(observation_keys)
-    wanted = ["actions", "rewards", "successes"]
-    wanted += [f"{group}/{part}" for group in ("obs", "next_obs") for part in observation_keys]
-    with _open(path) as file:
-        names = _names(path, file)
-        if split is not None:
-            key = f"mask/{split}"
-            mask = _array(path, file, key).reshape(-1)
-            chosen = [x.decode(errors="replace") if isinstance(x, bytes) else str(x) for x in mask]
-            unknown = sorted(set(chosen) - set(names))
-            if unknown:
-                raise DataError(path, key, f"names {unknown[0]!r}, which is not in the file")
-            names = chosen
-        if not names:
-            raise DataError(path, f"mask/{split}" if split else "data", "no demonstrations")
-        episodes = []
-        for name in names:
-            arrays = {key: _array(path, file, f"data/{name}/{key}") for key in wanted}
-            check_episode(path, f"data/{name}", arrays)
-            episodes.append(
-                {
-                    "name": name,
-                    "obs": {part: arrays[f"obs/{part}"] for part in observation_keys},
-                    "next_obs": {part: arrays[f"next_obs/{part}"] for part in observation_keys},
-                    **{key: arrays[key] for key in ("actions", "rewards", "successes")},
-                }
-            )
-        return episodes
+    # HDF5's default structures have no checksums, these have; "latest" could only be read by the
+    # very version that wrote it.
+    version = ("v110", "v110")
+    with atomic_path(path) as temporary, h5py.File(temporary, "w", libver=version) as file:
+        data = file.create_group("data")
+        names: list[str] = []
+        total = 0
+        for i, episode in enumerate(episodes):
+            names.append(f"demo_{i}")
+            for key in episode.extras:
+                if key.split("/")[0] in STEP_KEYS:
+                    message = f"an extra; valid: other names than {', '.join(STEP_KEYS)}"
+                    raise DataError(path, f"data/{names[-1]}/{key}", message)
+            _write_episode(data.create_group(names[-1]), episode)
+            total += len(episode)
+        texts = {"env_args": json.dumps(dict(env_args))}
+        _write_attributes(data, {"total": total, **texts, **(attributes or {})})
+        for name, positions in (masks or {}).items():
+            # Not as file["mask/..."]: a group made on the way carries the time of day.
+            mask = np.array([names[i] for i in positions], dtype="S")
+            _write_array(file.require_group("mask"), name, mask)
+
+
+def _write_episode(demo: h5py.Group, episode: Episode) -> None:
+    dones = np.zeros(len(episode), dtype=np.int64)
+    dones[-1:] = 1
+    arrays = {
+        **{f"obs/{name}": part for name, part in episode.observations.items()},
+        **{f"next_obs/{name}": part for name, part in episode.next_observations.items()},
+        "actions": episode.actions,
+        "rewards": episode.rewards,
+        "dones": dones,
+        "terminated": episode.terminated,
+        **episode.extras,
+    }
+    for key, array in arrays.items():
+        _write_array(demo, key, array)
+    _write_attributes(demo, {"num_samples": len(episode), **episode.attributes})
+
+
+def _write_array(group: h5py.Group, key: str, array: np.ndarray) -> None:
+    # The checksum of zeros is zero: a hole in a file would pass for data, but not for compressed
+    # ones. What has no elements cannot be cut into chunks, which checksums and filters belong to.
+    filters = {"compression": "gzip", "compression_opts": 1, "fletcher32": True}
+    group.create_dataset(key, data=array, **(filters if array.size else {}))
+
+
+def _write_attributes(group: h5py.Group, attributes: Mapping[str, Any]) -> None:
+    for name, value in attributes.items():
+        texts = [value] if isinstance(value, str) else value
+        if isinstance(texts, list | tuple) and all(isinstance(text, str) for text in texts):
+            # Texts of a fixed length lie in the group's header, which has a checksum. h5py's own of
+            # variable length lie in a heap that has none, and damaged may have HDF5 loop for ever.
+            encoded = [text.encode() for text in texts]
+            length = max([1, *map(len, encoded)])
+            array = np.array(encoded if texts is value else encoded[0], dtype=f"S{length}")
+            group.attrs.create(name, array, dtype=h5py.string_dtype("utf-8", length))
+        else:
+            group.attrs[name] = value
+
+
+def keep_episode(path: Path, episode: Episode) -> None:
+    """Keeps one episode as an npz file, atomically, until its file is complete."""
+    buffer = io.BytesIO()
+    np.savez(
+        buffer,
+        **{f"obs/{name}": part for name, part in episode.observations.items()},
+        **{f"next_obs/{name}": part for name, part in episode.next_observations.items()},
+        **{f"extras/{name}": array for name, array in episode.extras.items()},
+        actions=episode.actions,
+        rewards=episode.rewards,
+        terminated=episode.terminated,
+        attributes=np.frombuffer(json.dumps(dict(episode.attributes)).encode(), dtype=np.uint8),
+    )
+    write_atomic(path, buffer.getvalue())
+
+
+def read_kept_episode(path: Path) -> Episode:
+    """Reads what :func:`keep_episode` wrote.
+
+    Raises:
+        DataError: if the file is missing or damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {key: file[key] for key in file}
+        attributes = json.loads(arrays.pop("attributes").tobytes())
+
+        def group(prefix: str) -> dict[str, np.ndarray]:
+            return {
+                key.removeprefix(prefix): array
+                for key, array in arrays.items()
+                if key.startswith(prefix)
+            }
+
+        return Episode(
+            observations=group("obs/"),
+            next_observations=group("next_obs/"),
+            actions=arrays["actions"],
+            rewards=arrays["rewards"],
+            terminated=arrays["terminated"],
+            extras=group("extras/"),
+            attributes=attributes,
+        )
+    except (*DAMAGE, EOFError, zipfile.BadZipFile) as error:
+        raise DataError(path, None, f"not a whole episode ({error}); remove it") from error

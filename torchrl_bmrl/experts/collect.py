@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import (
-    Episode,
     count_episodes,
-    read_episode,
-    write_demonstrations,
-    write_episode,
+    keep_episode,
+    read_kept_episode,
+    write_episodes,
 )
 from torchrl_bmrl.envs.tasks import SawyerEnv, robosuite_metadata
 from torchrl_bmrl.errors import DataError
@@ -61,34 +61,39 @@ def collect_episode(task: str, seed: int, *, noise: float, gains: ExpertGains) -
     expert = make_expert(task, env.robosuite_env, gains)
     rng = np.random.default_rng(derive_seed(seed, "action noise"))
     observations = {name: [part] for name, part in observation.items()}
-    states = [env.robosuite_env.sim.get_state().flatten()]
-    actions, rewards, successes, phases = [], [], [], []
+    model_file = env.robosuite_env.sim.model.get_xml()
+    actions, rewards, successes, phases, states = [], [], [], [], []
     for _ in range(HORIZON):
         # What is stored is what was executed, to the bit.
         noisy = expert() + noise * rng.standard_normal(7)
         action = np.clip(noisy, -1.0, 1.0).astype(np.float32)
         phases.append(expert.phase)
+        states.append(env.robosuite_env.sim.get_state().flatten())
         observation, reward, _, _, info = env.step(action)
         for name, part in observation.items():
             observations[name].append(part)
-        states.append(env.robosuite_env.sim.get_state().flatten())
         actions.append(action)
         rewards.append(reward)
         successes.append(info["success"])
+    parts = {name: np.stack(rows) for name, rows in observations.items()}
     return Episode(
-        observations={name: np.stack(parts) for name, parts in observations.items()},
+        observations={name: part[:-1] for name, part in parts.items()},
+        next_observations={name: part[1:] for name, part in parts.items()},
         actions=np.stack(actions),
         rewards=np.array(rewards),
-        successes=np.array(successes),
-        phases=np.array(phases, dtype=np.int8),
-        states=np.stack(states),
-        seed=seed,
-        phase_names=expert.phases,
+        terminated=np.zeros(HORIZON, dtype=bool),
+        extras={
+            "successes": np.array(successes),
+            "phases": np.array(phases, dtype=np.int8),
+            "states": np.stack(states),
+        },
+        # robomimic plays states back in the model of the demonstration.
+        attributes={"seed": seed, "phase_names": list(expert.phases), "model_file": model_file},
     )
 
 
 def _collect_job(job: EpisodeJob, report: Report) -> None:
-    write_episode(job.path, collect_episode(job.task, job.seed, noise=job.noise, gains=job.gains))
+    keep_episode(job.path, collect_episode(job.task, job.seed, noise=job.noise, gains=job.gains))
     report(1)
 
 
@@ -152,10 +157,13 @@ def collect_demonstrations(
         unit="episode",
     )
     for task, paths in parts.items():
-        write_demonstrations(
+        write_episodes(
             files[task],
-            (read_episode(path) for path in paths),
-            train_episodes=episodes[task],
+            (read_kept_episode(path) for path in paths),
+            masks={
+                "train": range(episodes[task]),
+                "valid": range(episodes[task], counts[task]),
+            },
             env_args=robosuite_metadata(task),
             attributes={"task": task, "action_noise": noise, "seed": seed},
         )

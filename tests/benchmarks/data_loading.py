@@ -1,0 +1,128 @@
+"""Time and memory from demonstration files to the first sample, at the paper's size.
+
+    python tests/benchmarks/data_loading.py                  # 1,400 episodes of 200 steps
+    python tests/benchmarks/data_loading.py --share 0.1
+
+Files of random numbers in the layout of recipes/collect.py are written first. Then a fresh process
+converts them, another loads them again, and both say what they needed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from torchrl_bmrl.data import Episode, make_multi_task_replay_buffer
+from torchrl_bmrl.data.demonstrations import (
+    demonstration_path,
+    load_transitions,
+    read_statistics,
+    write_statistics,
+)
+from torchrl_bmrl.data.robomimic import write_episodes
+from torchrl_bmrl.data.schema import OBSERVATION_SHAPES
+from torchrl_bmrl.names import HORIZON, TASKS
+
+PAPER = {"reach": 500, "lift": 500} | {task: 100 for task in TASKS[2:]}
+
+
+def random_episode(rng: np.random.Generator) -> Episode:
+    """An episode as large as a collected one, model and states included."""
+    parts = {
+        name: rng.standard_normal((HORIZON + 1, size)) for name, size in OBSERVATION_SHAPES.items()
+    }
+    return Episode(
+        observations={name: part[:-1] for name, part in parts.items()},
+        next_observations={name: part[1:] for name, part in parts.items()},
+        actions=rng.uniform(-1, 1, (HORIZON, 7)).astype(np.float32),
+        rewards=rng.random(HORIZON),
+        terminated=np.zeros(HORIZON, bool),
+        extras={
+            "successes": rng.random(HORIZON) < 0.1,
+            "phases": np.zeros(HORIZON, np.int8),
+            "states": rng.standard_normal((HORIZON, 34)),
+        },
+        attributes={"seed": 0, "model_file": "x" * 41_000},
+    )
+
+
+def write(folder: Path, share: float) -> None:
+    """Files of all tasks."""
+    rng = np.random.default_rng(0)
+    for task, episodes in PAPER.items():
+        count = max(1, round(share * episodes))
+        write_episodes(
+            demonstration_path(folder, task),
+            (random_episode(rng) for _ in range(count)),
+            env_args={},
+            masks={"train": range(count)},
+        )
+
+
+@contextmanager
+def timed(name: str, seconds: dict[str, float]) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    seconds[name] = time.perf_counter() - start
+
+
+def load(folder: Path, batch_size: int) -> tuple[dict[str, float], int, float, float]:
+    """Seconds by stage, transitions, milliseconds a sample, peak memory [GB]."""
+    torch.set_num_threads(1)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    seconds: dict[str, float] = {}
+    with timed("statistics, converting what is new", seconds):
+        write_statistics(folder, PAPER)
+    statistics = read_statistics(folder)
+    with timed("transitions, normalised", seconds):
+        data = [
+            load_transitions(folder, task, statistics, split="train", num_task=i)
+            for i, task in enumerate(PAPER)
+        ]
+    with timed("multi-task buffer", seconds):
+        buffer = make_multi_task_replay_buffer(data, batch_size=batch_size)
+    for _ in range(20):
+        buffer.sample()
+    start, count = time.perf_counter(), 200
+    for _ in range(count):
+        buffer.sample()
+    sample = 1000 * (time.perf_counter() - start) / count
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    print(f"  (imports alone: {before / 1e6:.2f} GB)")
+    return seconds, sum(map(len, data)), sample, peak / 1e6
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--share", type=float, default=1.0, help="of the paper's episodes")
+    parser.add_argument("--batch-size", type=int, default=256, help="of each task")
+    options = parser.parse_args()
+    context = get_context("spawn")  # a fresh process: its peak memory is its own
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with context.Pool(1) as pool:
+            pool.apply(write, (folder, options.share))
+        size = sum(path.stat().st_size for path in folder.glob("*.hdf5"))
+        print(f"files: {size / 1e6:.0f} MB")
+        for round_name in ("first time", "again"):
+            with context.Pool(1) as pool:
+                result = pool.apply(load, (folder, options.batch_size))
+            seconds, transitions, sample, peak = result
+            print(f"{round_name}: {transitions:,} transitions, peak memory {peak:.2f} GB")
+            for stage, value in seconds.items():
+                print(f"  {stage:<36} {value:6.2f} s")
+            print(f"  a sample of {len(PAPER)} x {options.batch_size:<21} {sample:6.2f} ms")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,85 @@
+"""Random episodes, and files of them in robomimic's layout, that several test files share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_bmrl.data.episodes import Episode
+from torchrl_bmrl.data.robomimic import write_episodes
+from torchrl_bmrl.data.schema import OBSERVATION_SHAPES
+
+Parts = Mapping[str, tuple[tuple[int, ...], Any]]
+"""Shape of a row and dtype of each part of an observation."""
+
+PARTS: Parts = {"object": ((10,), np.float64), "image": ((8, 8, 3), np.uint8)}
+"""Not the six tasks': any robot's observations will do."""
+TASK_PARTS: Parts = {name: ((size,), np.float64) for name, size in OBSERVATION_SHAPES.items()}
+LENGTHS = (5, 6, 7, 8)
+ENV_ARGS = {"env_name": "BMRLSawyerLift", "type": 1, "env_version": "1", "env_kwargs": {"a": 1}}
+
+
+def make_episode(
+    seed: int = 0, steps: int = 5, *, parts: Parts = PARTS, terminated: bool = False
+) -> Episode:
+    """Random numbers; each next observation is the following step's observation."""
+    rng = np.random.default_rng(seed)
+    whole = {
+        name: (100 * rng.standard_normal((steps + 1, *shape))).astype(dtype)
+        if np.dtype(dtype).kind == "f"
+        else rng.integers(0, 100, (steps + 1, *shape)).astype(dtype)
+        for name, (shape, dtype) in parts.items()
+    }
+    return Episode(
+        observations={name: part[:-1] for name, part in whole.items()},
+        next_observations={name: part[1:] for name, part in whole.items()},
+        actions=rng.uniform(-1, 1, (steps, 7)).astype(np.float32),
+        rewards=rng.random(steps),
+        terminated=np.arange(steps) == (steps - 1 if terminated else -1),
+        extras={
+            "successes": rng.random(steps) < 0.5,
+            "phases": rng.integers(0, 3, steps).astype(np.int8),
+            "states": rng.standard_normal((steps, 11)),
+        },
+        attributes={
+            "seed": 2**32 - 1 - seed,
+            "phase_names": ["descend", "grasp", "lift"],
+            "model_file": f"<mujoco model='{seed}'>{'<geom/>' * 100}</mujoco>",
+        },
+    )
+
+
+def write_file(
+    path: Path, lengths: Sequence[int] = LENGTHS, *, train: int = 3, parts: Parts = PARTS
+) -> list[Episode]:
+    """Writes episodes of these lengths, the first ``train`` of them to train on."""
+    episodes = [make_episode(i, steps, parts=parts) for i, steps in enumerate(lengths)]
+    write_episodes(
+        path,
+        iter(episodes),
+        env_args=ENV_ARGS,
+        attributes={"task": "lift", "action_noise": 0.2},
+        masks={"train": range(train), "valid": range(train, len(lengths))},
+    )
+    return episodes
+
+
+def assert_same(read: Episode, made: Episode) -> None:
+    """Equal to the bit, names, order and dtypes included."""
+    for group in ("observations", "next_observations", "extras"):
+        ours, theirs = getattr(read, group), getattr(made, group)
+        assert set(ours) == set(theirs), group
+        for name in theirs:
+            assert_identical(ours[name], theirs[name])
+    for name in ("actions", "rewards", "terminated"):
+        assert_identical(getattr(read, name), getattr(made, name))
+    assert dict(read.attributes) == dict(made.attributes)
+
+
+def assert_identical(ours: np.ndarray, theirs: np.ndarray) -> None:
+    """Equal shapes, dtypes and bits."""
+    np.testing.assert_array_equal(ours, theirs, strict=True)
+    assert ours.tobytes() == theirs.tobytes()

@@ -1,0 +1,186 @@
+"""Any of the formats in, any of the formats out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from torchrl_bmrl.data import lerobot, minari, robomimic, robosuite
+from torchrl_bmrl.data.episodes import Episode
+from torchrl_bmrl.data.hdf5 import open_file, read_names
+from torchrl_bmrl.data.schema import Bounds, check_episode, layout_of
+from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
+
+TARGETS = ("robomimic", "minari", "lerobot")
+CONTROL_FREQUENCY = 20.0
+"""Steps per second [Hz] of sources that do not tell theirs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """A data set that is open for reading.
+
+    Attributes:
+        format: ``"robomimic"``, ``"robosuite"`` or ``"minari"``.
+        episodes: by name, each read when it is asked for.
+        prefix: of the names inside the file, for messages.
+        bounds: of floating-point actions; ``None`` where the format has none.
+        metadata: attributes of the file, ``env_args`` and ``masks`` among them.
+    """
+
+    format: str
+    episodes: Mapping[str, Episode]
+    prefix: str = "data/"
+    bounds: Bounds | None = (-1.0, 1.0)
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def fps(self) -> float:
+        """Steps per second [Hz]."""
+        kwargs = self.metadata.get("env_args", {}).get("env_kwargs", {})
+        known = self.metadata.get("fps") or kwargs.get("control_freq")
+        return float(known or CONTROL_FREQUENCY)
+
+
+def find_format(path: Path) -> str:
+    """Format of a data set: ``"robomimic"``, ``"robosuite"`` or ``"minari"``.
+
+    Raises:
+        DataError: if it is none of them.
+    """
+    if path.is_dir():
+        if (path / "data" / "main_data.hdf5").exists():
+            return "minari"
+        raise DataError(path, None, "a folder without data/main_data.hdf5; valid: Minari's, a file")
+    with open_file(path) as file:
+        for name in read_names(path, file, "data"):
+            present = read_names(path, file, f"data/{name}")
+            if "obs" in present:
+                return "robomimic"
+            if "states" in present:
+                return "robosuite"
+    raise DataError(path, "data", "no demonstration with obs (robomimic) or states (robosuite)")
+
+
+@contextmanager
+def open_source(
+    path: str | Path, *, task: str | None = None, tracking: float = 1.0, split: str | None = None
+) -> Iterator[Source]:
+    """Opens a data set of any format.
+
+    Args:
+        path: an HDF5 file, or the folder of a Minari data set.
+        task: whose scene a robosuite ``demo.hdf5`` was recorded in: it holds states alone.
+        tracking: see :func:`torchrl_bmrl.data.robosuite.open_episodes`.
+        split: name of a mask of a file in robomimic's layout.
+
+    Raises:
+        DataError: for a missing or damaged data set.
+        ConfigError: for a robosuite file without ``task``, or a ``split`` of one without masks.
+    """
+    path = Path(path).expanduser()
+    form = find_format(path)
+    if split is not None and form != "robomimic":
+        raise ConfigError(f"split is {split!r}, but {path} is {form}'s, which has no masks")
+    if form == "minari":
+        with minari.open_episodes(path) as episodes:
+            told = minari.read_metadata(path)
+            # As gymnasium's environments are in robomimic's layout.
+            env_args = {"env_name": told.get("dataset_id", path.name), "type": 2, "env_kwargs": {}}
+            metadata: dict[str, Any] = {"env_args": env_args}
+            if "fps" in told:
+                metadata["fps"] = told["fps"]
+            yield Source(format=form, episodes=episodes, prefix="", bounds=None, metadata=metadata)
+    elif form == "robomimic":
+        metadata = robomimic.read_metadata(path)
+        with robomimic.open_episodes(path, split=split) as episodes:
+            yield Source(format=form, episodes=episodes, metadata=metadata)
+    else:
+        if task is None:
+            raise ConfigError(
+                f"{path} holds simulator states alone; valid: --task, the task whose scene it is"
+            )
+        from torchrl_bmrl.envs.tasks import robosuite_metadata
+
+        with robosuite.open_episodes(path, task=task, tracking=tracking) as episodes:
+            metadata = {"env_args": robosuite_metadata(task), "task": task}
+            yield Source(format=form, episodes=episodes, metadata=metadata)
+
+
+def convert(
+    source: str | Path,
+    target: str | Path,
+    *,
+    to: str,
+    task: str | None = None,
+    tracking: float = 1.0,
+    split: str | None = None,
+    report: Callable[[int], object] = lambda _: None,
+) -> None:
+    """Writes a data set in another format, whole, or not at all; the source is only read.
+
+    Args:
+        source: an HDF5 file in robomimic's layout or of robosuite, or a Minari data set's folder.
+        target: what to write: a file for robomimic, a folder for Minari and LeRobot.
+        to: ``"robomimic"``, ``"minari"`` or ``"lerobot"``.
+        task: of a robosuite file; the text of LeRobot's task otherwise.
+        tracking: see :func:`torchrl_bmrl.data.robosuite.open_episodes`.
+        split: name of a mask of a file in robomimic's layout; ``None`` for all episodes.
+        report: called with 1 after every episode.
+
+    Raises:
+        UnknownNameError: for a format that cannot be written.
+        DataError: naming file, key and row for what cannot be trained on, for a target that exists
+            or cannot be written.
+    """
+    if to not in TARGETS:
+        raise UnknownNameError("format", to, TARGETS)
+    source, target = Path(source).expanduser(), Path(target).expanduser()
+    if target.exists():
+        raise DataError(target, None, "exists; valid: a new name")
+    with open_source(source, task=task, tracking=tracking, split=split) as data:
+        episodes = _checked(source, data, report)
+        try:
+            _write(target, to, data, episodes, task)
+        except BMRLError:
+            raise
+        except (OSError, RuntimeError) as error:  # RuntimeError: how h5py reports a full disk
+            raise DataError(target, None, f"cannot be written ({error})") from error
+
+
+def _write(
+    target: Path, to: str, data: Source, episodes: Iterator[Episode], task: str | None
+) -> None:
+    env_args = data.metadata.get("env_args", {})
+    name = task or data.metadata.get("task") or env_args.get("env_name") or target.name
+    if to == "robomimic":
+        names = list(data.episodes)
+        masks = {
+            mask: [names.index(name) for name in chosen if name in names]
+            for mask, chosen in data.metadata.get("masks", {}).items()
+        }
+        attributes = {
+            key: value
+            for key, value in data.metadata.items()
+            if key not in ("env_args", "masks", "total")
+        }
+        robomimic.write_episodes(
+            target, episodes, env_args=env_args, attributes=attributes, masks=masks
+        )
+    elif to == "minari":
+        minari.write_episodes(target, episodes, fps=data.fps, description=str(name))
+    else:
+        lerobot.write_episodes(target, episodes, fps=data.fps, task=str(name))
+
+
+def _checked(path: Path, data: Source, report: Callable[[int], object]) -> Iterator[Episode]:
+    layout = None
+    for name in data.episodes:
+        episode = data.episodes[name]
+        check_episode(path, f"{data.prefix}{name}", episode, layout=layout, bounds=data.bounds)
+        layout = layout or layout_of(episode)
+        yield episode
+        report(1)

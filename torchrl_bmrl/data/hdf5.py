@@ -1,0 +1,113 @@
+"""Reading HDF5 files that may be damaged, or something else altogether."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from torchrl_bmrl.errors import DataError
+
+DAMAGE = (OSError, RuntimeError, KeyError, TypeError, ValueError, MemoryError)
+"""What h5py raises on a damaged file, depending on where the damage is."""
+
+
+def open_file(path: str | Path) -> h5py.File:
+    """Opens a file for reading.
+
+    Raises:
+        DataError: if it is missing, no whole HDF5 file, or a git-LFS pointer to one.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DataError(path, None, "no such file")
+    try:
+        with path.open("rb") as file:
+            pointer = file.read(23) == b"version https://git-lfs"
+        if not pointer:
+            return h5py.File(path, "r")
+    except DAMAGE as error:
+        raise DataError(path, None, f"not a whole HDF5 file ({error})") from error
+    raise DataError(path, None, "a git-LFS pointer, not the data; `git lfs pull` fetches them")
+
+
+def read_names(path: str | Path, file: h5py.File, key: str) -> list[str]:
+    """Names in a group, ``demo_2`` before ``demo_10``.
+
+    Raises:
+        DataError: if there is no such group, or it cannot be read.
+    """
+    try:
+        group = file.get(key)
+        if isinstance(group, h5py.Group):
+            return sorted(group, key=_natural)
+    except DAMAGE as error:
+        raise DataError(path, key, f"unreadable ({error})") from error
+    raise DataError(path, key, "missing; valid: a group" if group is None else "not a group")
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    # Numbers by value, all else as text: (0, text) and (number, "") compare with each other.
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def read_array(path: str | Path, file: h5py.File, key: str) -> np.ndarray:
+    """The numbers of a dataset.
+
+    Raises:
+        DataError: if it is missing, a group, cannot be read, or holds anything but numbers.
+    """
+    try:
+        node = file.get(key)
+        if isinstance(node, h5py.Dataset):
+            if node.dtype.kind not in "biuf":
+                raise DataError(path, key, f"dtype {node.dtype}; valid: numbers")
+            array = np.asarray(node[()])
+            return array.astype(array.dtype.newbyteorder("="), copy=False)  # as torch wants it
+    except DataError:
+        raise
+    except DAMAGE as error:
+        raise DataError(path, key, f"unreadable ({error})") from error
+    raise DataError(path, key, "missing" if node is None else "a group; valid: a dataset")
+
+
+def read_strings(path: str | Path, file: h5py.File, key: str) -> list[str]:
+    """The strings of a dataset, bytes or text.
+
+    Raises:
+        DataError: if it is missing, a group, or cannot be read.
+    """
+    try:
+        node = file.get(key)
+        if isinstance(node, h5py.Dataset):
+            return [_text(value) for value in np.asarray(node[()]).reshape(-1)]
+    except DAMAGE as error:
+        raise DataError(path, key, f"unreadable ({error})") from error
+    raise DataError(path, key, "missing" if node is None else "a group; valid: a dataset")
+
+
+def read_attributes(path: str | Path, file: h5py.File, key: str) -> dict[str, Any]:
+    """Attributes of a group: text as ``str``, lists as lists, numbers as Python's.
+
+    Raises:
+        DataError: if they cannot be read.
+    """
+    try:
+        return {name: _plain(value) for name, value in file[key].attrs.items()}
+    except DAMAGE as error:
+        raise DataError(path, key, f"attributes unreadable ({error})") from error
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return [_plain(element) for element in value.tolist()]
+    if isinstance(value, bytes):
+        return _text(value)
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _text(value: Any) -> str:
+    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)

@@ -1,0 +1,386 @@
+"""robosuite's ``demo.hdf5`` as transitions of one of the six tasks.
+
+Such a file holds the simulator's states of a person's demonstrations, and neither observations nor
+rewards. Both are computed here from those states, never by replaying the input device::
+
+    data/demo_<i>             attribute model_file: models/<model_file> beside the file, or XML text
+        states                (T, 1 + nq + nv)  time [s], joint positions, joint velocities
+
+Two models take part. The recording's own MJCF, without its meshes, says which column is which
+joint, where the table stands and how large the cube is. The task's model then gets the same joints
+by name, the cube relative to its own table, and computes everything else with the task's functions.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, fields
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
+from torchrl_bmrl.data.hdf5 import open_file, read_names
+from torchrl_bmrl.data.recordings import Recording, read_recording, resample
+from torchrl_bmrl.errors import ConfigError, DataError
+from torchrl_bmrl.names import check_task
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from torchrl_bmrl.envs.tasks import _BMRLSawyerTask
+
+TRACKING = 0.22
+"""Share of a commanded position delta that the arm covers in one step, measured.
+
+The least-squares slope of what a person's demonstrations, executed as actions in this simulator,
+moved (0.21 along x, 0.17 along y, 0.25 along z; 0.18 to 0.20 of a rotation), whatever their scale.
+"""
+JOINTS = (*(f"right_j{i}" for i in range(7)), "l_finger_joint", "r_finger_joint")
+"""How the joints' names end; prefixes such as ``robot0_`` came with later versions."""
+MAX_MODEL_ERROR = 5e-3
+"""How far the end-effector may be apart in the two models [m]."""
+CLOSING_MOTION, OPENING_MOTION = 1e-3, 3e-3
+"""Change of the fingers' opening in one step that tells a command [m]. A cube that was squeezed
+pushes them apart again, by 2 mm a step, while they are still told to close."""
+FINGER_REST = 2e-3
+"""Fingers within this of their opening at rest under the command "open" are open [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Relabelling:
+    """What became of one demonstration.
+
+    Attributes:
+        name: of the demonstration.
+        steps: transitions at the control rate.
+        recorded_rows: rows of the recording.
+        duration: of the recording [s].
+        lift_height: the cube's height after the last step, above its place in the first recorded
+            row [m]; nan without a cube. Up to 50 ms of the recording come after the last step.
+        grasped_at_end: whether both fingers touch the cube then.
+        success: whether the task's own definition of success holds after some step.
+        action_error: largest distance between the path that the actions add up to and the
+            recorded path of the end-effector [m].
+        rotation_error: the same for its rotation [rad].
+        saturated_share: share of the steps whose motion does not fit into [-1, 1].
+        model_error: largest distance between the end-effector in the recording's model and in the
+            task's, both relative to the table [m].
+    """
+
+    name: str
+    steps: int
+    recorded_rows: int
+    duration: float
+    lift_height: float
+    grasped_at_end: bool
+    success: bool
+    action_error: float
+    rotation_error: float
+    saturated_share: float
+    model_error: float
+
+    @classmethod
+    def of(cls, name: str, episode: Episode) -> Relabelling:
+        """What the attributes of an episode of :func:`open_episodes` tell."""
+        kept = {field.name for field in fields(cls)}
+        return cls(
+            name=name,
+            steps=len(episode),
+            success=bool(episode.extras["successes"].any()),
+            **{key: value for key, value in episode.attributes.items() if key in kept},
+        )
+
+
+@contextmanager
+def open_episodes(
+    path: str | Path, *, task: str, tracking: float = 1.0
+) -> Iterator[Mapping[str, Episode]]:
+    r"""Demonstrations by name as episodes of a task, each computed when it is asked for.
+
+    Observations, rewards and successes are the task's own. Actions are differences of the
+    end-effector's recorded poses at the control rate (20 Hz), in the axes of the robot's base:
+
+    .. math::
+        a_k = \left(\frac{p_{k+1} - p_k}{0.05\,c},\;
+        \frac{\log(R_{k+1} R_k^\top)}{0.5\,c},\; g_k\right)
+
+    clipped to [-1, 1], with c = ``tracking`` and g the gripper, +1 closing (or holding the cube),
+    -1 opening, read off the fingers' motion. The states, at about 100 Hz with gaps of 10 to 24 ms,
+    are interpolated linearly onto the grid (quaternions normalised): the nearest row would be up to
+    12 ms early or late, a quarter of a step's motion.
+
+    Args:
+        path: the file; it is only read.
+        task: one of :data:`torchrl_bmrl.names.TASKS`; reach needs the goal, which only recordings
+            of that task have (their site ``goal_marker``).
+        tracking: share of a commanded delta that the arm covers within one step. The controller
+            measures deltas from the pose that it has reached: a command held at 1 moves the arm by
+            about 11 mm and not 50 mm a step. With 1 an action is the motion itself; with
+            :data:`TRACKING` (0.22) it is about what had to be commanded for it.
+
+    Yields:
+        episodes; ``extras``: ``successes`` and ``states``, the task's simulator before each action
+        ``(T, 1 + nq + nv)``; ``attributes``: ``model_file``, XML text of the task's simulator, and
+        the numbers of :class:`Relabelling`.
+
+    Raises:
+        UnknownNameError: for a name that is not a task.
+        ConfigError: if ``tracking`` is not in (0, 1].
+        DataError: naming file, key and row: on opening for a missing or damaged file, when an
+            episode is read for states or a model that are missing, damaged or of another scene.
+    """
+    check_task(task)
+    if not 0 < tracking <= 1:
+        raise ConfigError(f"tracking must be in (0, 1], got {tracking}")
+    with ExitStack() as stack:
+        file = stack.enter_context(open_file(path))
+        names = read_names(path, file, "data")
+        if not names:
+            raise DataError(path, "data", "no demonstrations")
+
+        @cache
+        def env() -> _BMRLSawyerTask:
+            # Loads the simulator: only once a recording has been read.
+            from torchrl_bmrl.envs.tasks import make_robosuite_env
+
+            made = make_robosuite_env(task, use_object_obs=False)
+            stack.callback(made.close)
+            return made
+
+        def read(name: str) -> Episode:
+            recording = read_recording(Path(path), file, name)
+            return _relabel(recording, env(), tracking)
+
+        yield LazyEpisodes(names, read)
+
+
+def relabelling_table(path: str | Path, *, task: str, tracking: float = 1.0) -> list[Relabelling]:
+    """What becomes of every demonstration of a file; see :func:`open_episodes`."""
+    with open_episodes(path, task=task, tracking=tracking) as episodes:
+        return [Relabelling.of(name, episode) for name, episode in episodes.items()]
+
+
+# -- from one model to the other -------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Scene:
+    """Where a model keeps what both models have: the same function finds it in either.
+
+    ``columns``: of a flattened state, by joint. ``hand``: the body that carries the gripper.
+    ``cube``: shapes of the cube. ``table``: centre of the table's surface (3,) [m].
+    """
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    columns: dict[str, list[int]]
+    hand: int
+    cube: list[int]
+    table: np.ndarray
+
+
+def _find_scene(recording: Recording, model: mujoco.MjModel, *, cube: bool) -> _Scene:
+    import mujoco
+
+    joints = [model.joint(i).name for i in range(model.njnt)]
+    # The cube's joint has been called cube, cube_jnt0 and cube_joint0.
+    joints = ["cube" if name.startswith("cube") else name for name in joints]
+    bodies = [model.body(i).name for i in range(model.nbody)]
+    geoms = [model.geom(i).name for i in range(model.ngeom)]
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    table = _only(recording, "geom", "table_collision", geoms)
+    columns: dict[str, list[int]] = {}
+    boxes: list[int] = []
+    for name in (*JOINTS, "cube") if cube else JOINTS:
+        joint = _only(recording, "joint", name, joints)
+        positions, velocities = (7, 6) if name == "cube" else (1, 1)
+        first, second = 1 + model.jnt_qposadr[joint], 1 + model.nq + model.jnt_dofadr[joint]
+        columns[name] = [*range(first, first + positions), *range(second, second + velocities)]
+        if name == "cube":
+            boxes = [
+                i
+                for i in range(model.ngeom)
+                if model.geom_bodyid[i] == model.jnt_bodyid[joint]
+                and model.geom_type[i] == mujoco.mjtGeom.mjGEOM_BOX
+            ]
+            if not boxes or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
+                raise recording.error("the cube in its model is not a free box")
+    return _Scene(
+        model=model,
+        data=data,
+        columns=columns,
+        hand=_only(recording, "body", "right_hand", bodies),
+        cube=boxes,
+        table=data.geom_xpos[table] + [0, 0, model.geom_size[table, 2]],
+    )
+
+
+def _only(recording: Recording, kind: str, ending: str, names: list[str]) -> int:
+    """Index of the one name that ends like this."""
+    found = [i for i, name in enumerate(names) if name.endswith(ending)]
+    if len(found) != 1:
+        there = ", ".join(name for name in names if name)
+        raise recording.error(f"its model has {len(found)} x {kind} ...{ending}; there: {there}")
+    return found[0]
+
+
+def _set_cube_size(scene: _Scene, size: np.ndarray) -> None:
+    """Gives the cube its half sizes (3,) [m], and the bounds that MuJoCo derives from them."""
+    model = scene.model
+    model.geom_size[scene.cube] = size
+    model.geom_rbound[scene.cube] = np.linalg.norm(size)
+    model.geom_aabb[scene.cube, 3:] = size
+    body = model.geom_bodyid[scene.cube[0]]
+    first = model.body_bvhadr[body]
+    model.bvh_aabb[first : first + model.body_bvhnum[body], 3:] = size
+
+
+def _transfer(recording: Recording, env: _BMRLSawyerTask, there: _Scene, rows: np.ndarray) -> Any:
+    """The task's states (N, 1 + nq + nv) and scene for the recording's; sets cube and goal."""
+    here = _find_scene(recording, env.sim.model._model, cube=env.has_cube)
+    # The table and not the robot's base ties the scenes together: the bases differ by 1 mm in
+    # height, the fingers' and the cube's places over the table by 0.1 mm.
+    shift = here.table - there.table
+    states = np.tile(env.sim.get_state().flatten(), (len(rows), 1))
+    states[:, 0] = rows[:, 0]
+    for name, columns in here.columns.items():
+        states[:, columns] = rows[:, there.columns[name]]
+    if env.has_cube:
+        position = here.columns["cube"][:3]
+        states[:, position] += shift
+        env.cube_start = states[0, position].copy()
+        _set_cube_size(here, there.model.geom_size[there.cube[0]])
+    else:
+        sites = [there.model.site(i).name for i in range(there.model.nsite)]
+        goal = there.data.site_xpos[_only(recording, "site", "goal_marker", sites)] + shift
+        env._goal = env.sim.model.site_pos[env._goal_site_id] = goal
+    return states, here
+
+
+def _observe(env: _BMRLSawyerTask, states: np.ndarray) -> tuple[dict[str, np.ndarray], Any]:
+    """The task's view of its states: parts of the observation; rotations, rewards, successes."""
+    seen: dict[str, list[Any]] = {}
+    for state in states:
+        env.sim.set_state_from_flattened(state)
+        env.sim.forward()
+        row = env.named_observation() | {
+            "rotation": env.eef_rotation,
+            "reward": env.reward(),
+            "success": env._check_success(),
+        }
+        for name, part in row.items():
+            seen.setdefault(name, []).append(part)
+    parts = {name: np.array(values) for name, values in seen.items()}
+    return parts, (parts.pop("rotation"), parts.pop("reward"), parts.pop("success"))
+
+
+def _recorded_path(
+    recording: Recording, env: _BMRLSawyerTask, there: _Scene, here: _Scene, rows: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The end-effector's path (N, 3) [m] by the recording's model, and rotations (N, 3, 3).
+
+    It is the task's end-effector, carried by the recording's hand: files differ in where theirs is
+    (11.5 mm further out in 2018) and how it is turned.
+    """
+    import mujoco
+
+    hand = env.sim.data.body_xmat[here.hand].reshape(3, 3)
+    tool = hand.T @ (env.eef_position - env.sim.data.body_xpos[here.hand])
+    path, rotations = np.empty((len(rows), 3)), np.empty((len(rows), 3, 3))
+    for k, row in enumerate(rows):
+        there.data.qpos[:] = row[1 : 1 + there.model.nq]
+        mujoco.mj_kinematics(there.model, there.data)
+        rotations[k] = there.data.xmat[there.hand].reshape(3, 3)
+        path[k] = there.data.xpos[there.hand] + rotations[k] @ tool + here.table - there.table
+    return path, rotations
+
+
+def _relabel(recording: Recording, env: _BMRLSawyerTask, tracking: float) -> Episode:
+    there = _find_scene(recording, recording.model, cube=env.has_cube)
+    rows = resample(recording, env.control_freq)
+    states, here = _transfer(recording, env, there, rows)
+    parts, (rotations, rewards, successes) = _observe(env, states)
+    path, hands = _recorded_path(recording, env, there, here, rows)
+    apart = np.linalg.norm(path - parts["robot0_eef_pos"], axis=1)
+    if apart.max() > MAX_MODEL_ERROR:
+        raise recording.error(
+            f"row {apart.argmax()} at {env.control_freq} Hz: the end-effector is "
+            f"{1e3 * apart.max():.1f} mm from where the task's model has it; "
+            f"valid: {1e3 * MAX_MODEL_ERROR:g} mm"
+        )
+    scale = tracking * env.robots[0].part_controllers["right"].output_max
+    motion = _motion(parts["robot0_eef_pos"], rotations) / scale
+    gripper = _gripper_commands(parts["robot0_gripper_qpos"] @ [1.0, -1.0])
+    actions = np.column_stack([motion.clip(-1, 1), gripper]).astype(np.float32)
+    action_error, rotation_error = _action_errors(scale * actions[:, :6], path, hands)
+    return Episode(
+        observations={name: part[:-1] for name, part in parts.items()},
+        next_observations={name: part[1:] for name, part in parts.items()},
+        actions=actions,
+        rewards=rewards[1:],
+        terminated=np.zeros(len(actions), dtype=bool),
+        extras={"successes": successes[1:], "states": states[:-1]},
+        attributes={
+            "model_file": env.sim.model.get_xml(),
+            "recorded_rows": len(recording.states),
+            "duration": float(np.ptp(recording.states[:, 0])),
+            "lift_height": float(env.cube_displacement[2]) if env.has_cube else float("nan"),
+            "grasped_at_end": env.has_cube and env.grasped,
+            "action_error": action_error,
+            "rotation_error": rotation_error,
+            "saturated_share": float((np.abs(motion) > 1).any(axis=1).mean()),
+            "model_error": float(apart.max()),
+        },
+    )
+
+
+# -- actions ---------------------------------------------------------------------------------------
+
+
+def _motion(path: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Differences (N - 1, 6) of poses: position [m], axis-angle [rad], in the world's axes.
+
+    The robot's base, whose axes the controller uses, is not turned against the world.
+    """
+    from scipy.spatial.transform import Rotation
+
+    turns = Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1)).as_rotvec()
+    return np.hstack([np.diff(path, axis=0), turns])
+
+
+def _gripper_commands(opening: np.ndarray) -> np.ndarray:
+    """Commands (N - 1,), +1 closes, -1 opens, from the distance between the fingers (N,) [m].
+
+    Fingers that move tell the command; fingers at rest wide open are told to open; fingers that
+    something stops (the cube, each other) keep the command that brought them there. Before the
+    first motion whatever is not open is closing.
+    """
+    from torchrl_bmrl.envs.tasks import GRIPPER_OPEN
+
+    rest = GRIPPER_OPEN @ [1.0, -1.0] - FINGER_REST
+    commands, command = [], 1.0
+    for before, after in itertools.pairwise(opening):
+        if before - after > CLOSING_MOTION:
+            command = 1.0
+        elif after - before > OPENING_MOTION or after > rest:
+            command = -1.0
+        commands.append(command)
+    return np.array(commands)
+
+
+def _action_errors(motion: np.ndarray, path: np.ndarray, hands: np.ndarray) -> tuple[float, float]:
+    """Largest distance [m] and angle [rad] between what motions (T, 6) add up to and a path."""
+    from scipy.spatial.transform import Rotation
+
+    reached = path[0] + np.cumsum(motion[:, :3], axis=0)
+    rotation, angles = Rotation.from_matrix(hands[0]), []
+    for turn, hand in zip(Rotation.from_rotvec(motion[:, 3:]), hands[1:], strict=True):
+        rotation = turn * rotation
+        angles.append((rotation * Rotation.from_matrix(hand).inv()).magnitude())
+    return float(np.linalg.norm(reached - path[1:], axis=1).max()), float(max(angles))
