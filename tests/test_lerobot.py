@@ -209,7 +209,7 @@ def with_jump() -> Episode:
         ([], "no episodes; valid: at least one"),
         ([with_image()], r"episode_0/obs/camera: .*images are not exported; valid: one number"),
         ([make_episode(1), with_jump()], "episode_1/next_obs/opening: row 0 differs from row 1"),
-        ([make_episode(), make_episode(extras={})], "episode_1/states: missing"),
+        ([make_episode(), make_episode(extras={})], "episode_1/successes: missing"),
         ([make_episode(actions=np.zeros((5, 2, 2)))], "episode_0/actions: .*valid: one number"),
     ],
 )

@@ -333,7 +333,10 @@ REFUSED: dict[str, tuple[Callable[[Episode], Episode], str]] = {
         lambda e: with_parts(e, rewards=e.rewards.astype(np.float32)),
         "episode_1/rewards: dtype float32",
     ),
-    "missing extras": (lambda e: with_parts(e, extras={}), "episode_1/phases: missing"),
+    "missing extras": (
+        lambda e: with_parts(e, extras={"successes": e.extras["successes"]}),
+        "episode_1/phases: missing",
+    ),
     "too few rows": (lambda e: with_parts(e, rewards=e.rewards[:-1]), "episode_1/rewards: shape"),
     "a dictionary": (
         lambda e: with_parts(e, attributes={"a": {"b": 1}}),

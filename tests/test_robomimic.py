@@ -35,6 +35,7 @@ from torchrl_bmrl.data.robomimic import (
     read_metadata,
     write_episodes,
 )
+from torchrl_bmrl.data.schema import find_problems
 from torchrl_bmrl.errors import BMRLError, DataError
 
 Damage = Callable[[Any], None]
@@ -164,8 +165,19 @@ def test_only_the_extras_asked_for_are_read(path: Path) -> None:
     wanted = ["successes", "phases", "absent"]
     assert set(read(path, extras=wanted)["demo_1"].extras) == {"successes", "phases"}
     assert read(path, extras=[])["demo_1"].extras == {}
-    with pytest.raises(DataError, match=f"{DEMO}/states: "):
-        read(path)
+
+
+def test_what_other_tools_keep_beside_the_steps_is_left_alone(path: Path) -> None:
+    def edit_demo(file: Any) -> None:
+        del file[f"{DEMO}/states"]
+        file[f"{DEMO}/datagen_info/target"] = np.zeros((3, 4, 4))
+        file[f"{DEMO}/src_demo_inds"] = np.zeros(2)
+        file[f"{DEMO}/text"] = "words"
+
+    edit(path, edit_demo)
+    assert set(read(path)["demo_1"].extras) == {"successes", "phases"}
+    edit(path, put(f"{DEMO}/successes", np.zeros(2)))  # but these are trained on
+    assert list(find_problems(read(path)["demo_1"]))[0][0] == "successes"
 
 
 def test_attributes_come_back_as_python_s_own_types(tmp_path: Path) -> None:

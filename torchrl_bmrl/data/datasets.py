@@ -147,7 +147,7 @@ def _convert(source: Path, target: Path, options: Mapping[str, Any], split_trajs
         temporary.mkdir(parents=True)
         with open_episodes(source, extras=["successes"], **options) as episodes:
             steps = count_steps(source, episodes)
-            write_ted(temporary / "data", source, episodes, steps)
+            _write_rows(temporary / "data", source, episodes, steps)
             metadata = read_metadata(source) | {"episodes": list(episodes)}
         if split_trajs:
             _split(temporary / "data")
@@ -167,7 +167,7 @@ def _convert(source: Path, target: Path, options: Mapping[str, Any], split_trajs
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def write_ted(path: Path, source: Path, episodes: Mapping[str, Episode], steps: int) -> None:
+def _write_rows(path: Path, source: Path, episodes: Mapping[str, Episode], steps: int) -> None:
     """Writes episodes one after the other into memory-mapped tensors.
 
     Only one episode is in memory at a time, however large the data set.
@@ -223,6 +223,3 @@ def _flush(path: Path) -> None:
         if file.is_file():
             with file.open("rb") as handle:
                 os.fsync(handle.fileno())
-
-
-__all__ = ["RobomimicExperienceReplay", "write_ted"]

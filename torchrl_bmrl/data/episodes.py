@@ -62,7 +62,7 @@ class LazyEpisodes(Mapping[str, Episode]):
     """
 
     def __init__(self, names: Iterable[str], read: Callable[[str], Episode]) -> None:
-        self._names = list(names)
+        self._names = dict.fromkeys(names)  # in order, and found at once
         self._read = read
 
     def __getitem__(self, name: str) -> Episode:

@@ -1,8 +1,9 @@
-"""Reading HDF5 files that may be damaged, or something else altogether."""
+"""HDF5 files that may be damaged, or something else altogether."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +100,21 @@ def read_attributes(path: str | Path, file: h5py.File, key: str) -> dict[str, An
         return {name: _plain(value) for name, value in file[key].attrs.items()}
     except DAMAGE as error:
         raise DataError(path, key, f"attributes unreadable ({error})") from error
+
+
+def write_attributes(group: h5py.Group, attributes: Mapping[str, Any]) -> None:
+    """Writes numbers, texts and lists of them, so that damage is found when they are read."""
+    for name, value in attributes.items():
+        texts = [value] if isinstance(value, str) else value
+        if isinstance(texts, list | tuple) and all(isinstance(text, str) for text in texts):
+            # Texts of a fixed length lie in the group's header, which has a checksum. h5py's own of
+            # variable length lie in a heap that has none, and damaged may have HDF5 loop for ever.
+            encoded = [text.encode() for text in texts]
+            length = max([1, *map(len, encoded)])
+            array = np.array(encoded if texts is value else encoded[0], dtype=f"S{length}")
+            group.attrs.create(name, array, dtype=h5py.string_dtype("utf-8", length))
+        else:
+            group.attrs[name] = value
 
 
 def _plain(value: Any) -> Any:

@@ -33,7 +33,14 @@ import h5py
 import numpy as np
 
 from torchrl_bmrl.data.episodes import Episode, LazyEpisodes, join_observations
-from torchrl_bmrl.data.hdf5 import DAMAGE, open_file, read_array, read_attributes, read_names
+from torchrl_bmrl.data.hdf5 import (
+    DAMAGE,
+    open_file,
+    read_array,
+    read_attributes,
+    read_names,
+    write_attributes,
+)
 from torchrl_bmrl.data.schema import check_episode, layout_of
 from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.files import new_folder
@@ -98,6 +105,9 @@ def write_episodes(
         with h5py.File(folder / "data" / "main_data.hdf5", "w", libver="latest") as file:
             for i, episode in enumerate(chain([first], remaining)):
                 check_episode(path, f"episode_{i}", episode, layout=layout, bounds=None)
+                for key in sorted(set(first.extras) ^ set(episode.extras)):
+                    message = "missing; valid: the same extras in all episodes"
+                    raise DataError(path, f"episode_{i}/{key}", message)
                 _write_episode(path, file.create_group(f"episode_{i}"), i, episode)
                 lengths.append(len(episode))
         metadata = {
@@ -188,7 +198,7 @@ def _write_episode(path: Path, group: h5py.Group, number: int, episode: Episode)
         try:
             if key in _OWN_ATTRIBUTES:
                 raise ValueError("a name of Minari's own")
-            group.attrs[key] = list(value) if isinstance(value, tuple) else value
+            write_attributes(group, {key: value})
         except DAMAGE as error:
             raise DataError(path, f"{name}, attribute {key!r}", f"{message} ({error})") from error
     group.attrs.update({"id": number, "total_steps": len(episode)})

@@ -36,6 +36,7 @@ from torchrl_bmrl.data.hdf5 import (
     read_attributes,
     read_names,
     read_strings,
+    write_attributes,
 )
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.files import atomic_path, write_atomic
@@ -58,7 +59,8 @@ def open_episodes(
         path: the HDF5 file; it is only read.
         split: name of a mask, such as ``"train"``; ``None`` for all.
         observation_keys: parts of the observation to read; ``None`` for all.
-        extras: further arrays to read, those of them that are there; ``None`` for all.
+        extras: further arrays to read, those of them that are there; ``None`` for all that have a
+            row of numbers for each step.
         dones_terminate: what ``dones`` means at the last step of files without ``terminated``:
             robomimic's simulators never terminate, so that by default an episode's end truncates.
 
@@ -118,7 +120,18 @@ def _read_episode(
         parts = read_names(path, file, f"{demo}/obs")
     observations = {part: read_array(path, file, f"{demo}/obs/{part}") for part in parts}
     actions = read_array(path, file, f"{demo}/actions")
-    wanted = [key for key in present if key not in STEP_KEYS and (extras is None or key in extras)]
+    if not actions.ndim:
+        raise DataError(path, f"{demo}/actions", "one number; valid: (T, action_dim)")
+    wanted = [
+        key
+        for key in present
+        if key not in STEP_KEYS
+        and (
+            _is_extra(path, file, f"{demo}/{key}", len(actions))
+            if extras is None
+            else key in extras
+        )
+    ]
     steps: dict[str, np.ndarray] = {"actions": actions}
     steps["rewards"] = read_array(path, file, f"{demo}/rewards")
     if "terminated" in present:
@@ -152,6 +165,17 @@ def _read_episode(
             if key != "num_samples"
         },
     )
+
+
+def _is_extra(path: str | Path, file: h5py.File, key: str, steps: int) -> bool:
+    """Whether it has a row of numbers for each step; other tools keep all sorts of things."""
+    try:
+        node = file[key]
+        if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "biuf":
+            return False
+        return node.shape[:1] == (steps,) or key.endswith("/successes")
+    except DAMAGE as error:
+        raise DataError(path, key, f"unreadable ({error})") from error
 
 
 def _read_flags(path: str | Path, file: h5py.File, key: str) -> np.ndarray:
@@ -249,7 +273,7 @@ def write_episodes(
             _write_episode(data.create_group(names[-1]), episode)
             total += len(episode)
         texts = {"env_args": json.dumps(dict(env_args))}
-        _write_attributes(data, {"total": total, **texts, **(attributes or {})})
+        write_attributes(data, {"total": total, **texts, **(attributes or {})})
         for name, positions in (masks or {}).items():
             # Not as file["mask/..."]: a group made on the way carries the time of day.
             mask = np.array([names[i] for i in positions], dtype="S")
@@ -270,7 +294,7 @@ def _write_episode(demo: h5py.Group, episode: Episode) -> None:
     }
     for key, array in arrays.items():
         _write_array(demo, key, array)
-    _write_attributes(demo, {"num_samples": len(episode), **episode.attributes})
+    write_attributes(demo, {"num_samples": len(episode), **episode.attributes})
 
 
 def _write_array(group: h5py.Group, key: str, array: np.ndarray) -> None:
@@ -278,20 +302,6 @@ def _write_array(group: h5py.Group, key: str, array: np.ndarray) -> None:
     # ones. What has no elements cannot be cut into chunks, which checksums and filters belong to.
     filters = {"compression": "gzip", "compression_opts": 1, "fletcher32": True}
     group.create_dataset(key, data=array, **(filters if array.size else {}))
-
-
-def _write_attributes(group: h5py.Group, attributes: Mapping[str, Any]) -> None:
-    for name, value in attributes.items():
-        texts = [value] if isinstance(value, str) else value
-        if isinstance(texts, list | tuple) and all(isinstance(text, str) for text in texts):
-            # Texts of a fixed length lie in the group's header, which has a checksum. h5py's own of
-            # variable length lie in a heap that has none, and damaged may have HDF5 loop for ever.
-            encoded = [text.encode() for text in texts]
-            length = max([1, *map(len, encoded)])
-            array = np.array(encoded if texts is value else encoded[0], dtype=f"S{length}")
-            group.attrs.create(name, array, dtype=h5py.string_dtype("utf-8", length))
-        else:
-            group.attrs[name] = value
 
 
 def keep_episode(path: Path, episode: Episode) -> None:

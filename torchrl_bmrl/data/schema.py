@@ -44,8 +44,15 @@ def arrays_of(episode: Episode) -> dict[str, np.ndarray]:
 
 
 def layout_of(episode: Episode) -> Layout:
-    """Shape of a row and dtype of every array: all episodes of a data set share them."""
-    return {key: (array.shape[1:], array.dtype) for key, array in arrays_of(episode).items()}
+    """Shape of a row and dtype of what all episodes of a data set share.
+
+    Extras are left out, but for ``successes``: models, and so states, may differ.
+    """
+    return {
+        key: (array.shape[1:], array.dtype)
+        for key, array in arrays_of(episode).items()
+        if key not in episode.extras or key == "successes"
+    }
 
 
 def find_problems(
@@ -82,10 +89,10 @@ def find_problems(
         return
     if not episode.observations:
         yield "obs", "no part of an observation; valid: at least one"
-    faulty = set()
+    faulty, shared = set(), layout_of(episode)
     for key, array in arrays.items():
         problem = _array_problem(key, array, steps)
-        if problem is None and layout is not None:
+        if problem is None and layout is not None and key in shared:
             problem = _layout_problem(key, array, layout)
         if problem is not None:
             faulty.add(key)
