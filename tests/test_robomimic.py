@@ -177,7 +177,7 @@ def test_what_other_tools_keep_beside_the_steps_is_left_alone(path: Path) -> Non
     edit(path, edit_demo)
     assert set(read(path)["demo_1"].extras) == {"successes", "phases"}
     edit(path, put(f"{DEMO}/successes", np.zeros(2)))  # but these are trained on
-    assert list(find_problems(read(path)["demo_1"]))[0][0] == "successes"
+    assert next(find_problems(read(path)["demo_1"]))[0] == "successes"
 
 
 def test_attributes_come_back_as_python_s_own_types(tmp_path: Path) -> None:
