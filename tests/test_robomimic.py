@@ -176,7 +176,9 @@ def test_what_other_tools_keep_beside_the_steps_is_left_alone(path: Path) -> Non
 
     edit(path, edit_demo)
     assert set(read(path)["demo_1"].extras) == {"successes", "phases"}
-    edit(path, put(f"{DEMO}/successes", np.zeros(2)))  # but these are trained on
+    edit(path, put(f"{DEMO}/successes", "words"))  # but these are this library's
+    assert refusal(path).key == f"{DEMO}/successes"
+    edit(path, put(f"{DEMO}/successes", np.zeros(2)))
     assert next(find_problems(read(path)["demo_1"]))[0] == "successes"
 
 

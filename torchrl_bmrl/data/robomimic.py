@@ -169,11 +169,13 @@ def _read_episode(
 
 def _is_extra(path: str | Path, file: h5py.File, key: str, steps: int) -> bool:
     """Whether it has a row of numbers for each step; other tools keep all sorts of things."""
+    if key.endswith("/successes"):  # this library's own: damage to them is not left alone
+        return True
     try:
         node = file[key]
         if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "biuf":
             return False
-        return node.shape[:1] == (steps,) or key.endswith("/successes")
+        return node.shape[:1] == (steps,)
     except DAMAGE as error:
         raise DataError(path, key, f"unreadable ({error})") from error
 
