@@ -28,7 +28,7 @@ from train_bcq import train_agent
 
 from torchrl_bmrl.agents import load_bcq_loss
 from torchrl_bmrl.data import make_mixed_replay_buffer
-from torchrl_bmrl.data.convert import convert
+from torchrl_bmrl.data.convert import convert, find_format
 from torchrl_bmrl.data.demonstrations import load_transitions, read_demonstrations, read_statistics
 from torchrl_bmrl.envs.transforms import make_env, transform_data
 from torchrl_bmrl.errors import ConfigError
@@ -91,10 +91,7 @@ def evaluate_job(job: Job, report: Report) -> list[dict]:
 
 
 def comparison(rows: list[dict], shares: list[float]) -> str:
-    """Table of all shares, with the difference from share 0 on the same starts.
-
-    Intervals are over episodes of these agents, not over further trainings.
-    """
+    """Table of all shares, with the difference from share 0 on the same starts."""
 
     def column(share: float, field: str) -> np.ndarray:
         return np.array([float(row[field]) for row in rows if float(row["share"]) == share])
@@ -115,6 +112,7 @@ def comparison(rows: list[dict], shares: list[float]) -> str:
             f"| {share:.0%} | {returns.mean():.1f} | {successes.sum():.0f} of {len(successes)} | "
             + (f"{against} | {verdict} |" if share else "| |")
         )
+    lines += ["", "Intervals are over episodes of these agents, not over further trainings."]
     return "\n".join(lines) + "\n"
 
 
@@ -127,7 +125,9 @@ def learn_from_people(config: Config) -> None:
     config = replace(config, tasks=[TASK])
     human = Path(config.run_dir) / "data" / "human.hdf5"
     if not human.exists():
-        convert(config.human.path, human, to="robomimic", task=TASK, tracking=config.human.tracking)
+        raw = find_format(Path(config.human.path)) == "robosuite"
+        options = {"task": TASK, "tracking": config.human.tracking} if raw else {}
+        convert(config.human.path, human, to="robomimic", **options)
     collect(config)
     agents = [
         (config, share, seed)

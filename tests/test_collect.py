@@ -84,7 +84,7 @@ def test_the_file_has_the_layout_of_robomimic(collected: dict[str, Path]) -> Non
             assert env_args["type"] == 1
             assert env_args["env_name"] == f"BMRLSawyer{task.title()}"
             assert env_args["env_kwargs"]["robots"] == "Sawyer"
-            assert (data.attrs["task"], data.attrs["seed"]) == (task, 3)
+            assert (data.attrs["task"], data.attrs["seed"]) == (task.encode(), 3)
             assert data.attrs["action_noise"] == 0.2
             for name in names:
                 demo = data[name]

@@ -102,8 +102,11 @@ def test_lerobot_gets_the_control_rate_and_the_task_of_the_file(
     robomimic.write_episodes(tmp_path / "a.hdf5", episodes, env_args=args)
     convert(tmp_path / "a.hdf5", tmp_path / "le", to="lerobot")
     assert told == {"fps": 50.0, "task": "Lift", "count": 1}
-    convert(tmp_path / "a.hdf5", tmp_path / "le", to="lerobot", task="lift")
-    assert told["task"] == "lift"
+    robomimic.write_episodes(
+        tmp_path / "b.hdf5", episodes, env_args=args, attributes={"task": "lift a cube"}
+    )
+    convert(tmp_path / "b.hdf5", tmp_path / "le", to="lerobot")
+    assert told["task"] == "lift a cube"
 
 
 def test_the_control_rate_survives_minari(tmp_path: Path) -> None:
@@ -169,6 +172,8 @@ def test_unknown_formats_and_options_that_do_not_fit_are_named(path: Path, tmp_p
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match=r"empty: a folder without data/main_data\.hdf5"):
         convert(tmp_path / "empty", tmp_path / "a", to="robomimic")
+    with pytest.raises(ConfigError, match=r"task and tracking are for .*robomimic's"):
+        convert(path, tmp_path / "a", to="robomimic", task="lift")
     with h5py.File(tmp_path / "other.hdf5", "w") as file:
         file["data/demo_0/actions"] = np.zeros((3, 7))
     with pytest.raises(DataError, match=r"no demonstration with obs .* or states"):
@@ -180,6 +185,20 @@ def test_states_alone_need_a_task(tmp_path: Path) -> None:
         file["data/demo_1/states"] = np.zeros((3, 34))
     with pytest.raises(ConfigError, match="--task"), open_source(tmp_path / "demo.hdf5"):
         pass
+
+
+def test_a_faulty_mask_is_told_by_the_check_and_stops_a_conversion(
+    path: Path, tmp_path: Path, capsys: Any
+) -> None:
+    with h5py.File(path, "r+") as file:
+        del file["mask/valid"]
+        file["mask/valid"] = np.array([b"demo_9"])
+    assert main(["check", str(path)]) == 1
+    message = f"{path}: mask/valid: row 0 names 'demo_9', which is not in the file"
+    assert message in capsys.readouterr().err
+    with pytest.raises(DataError, match="names 'demo_9'"):
+        convert(path, tmp_path / "a.hdf5", to="robomimic")
+    assert not (tmp_path / "a.hdf5").exists()
 
 
 # -- the command line ------------------------------------------------------------------------------

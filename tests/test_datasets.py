@@ -7,6 +7,7 @@ import json
 import multiprocessing
 import os
 import resource
+import shutil
 import signal
 from collections.abc import Sequence
 from dataclasses import replace
@@ -44,7 +45,7 @@ from torchrl_bmrl.data.demonstrations import (
 )
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import write_episodes
-from torchrl_bmrl.errors import BMRLError, DataError, UnknownNameError
+from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
 
 TOTAL = sum(LENGTHS)
 SPAWN = multiprocessing.get_context("spawn")
@@ -233,6 +234,87 @@ def test_the_buffer_refuses_to_be_written_to(path: Path) -> None:
     replay = RobomimicExperienceReplay(path)
     with pytest.raises(RuntimeError):
         replay.extend(replay[:2])
+    with pytest.raises(BMRLError, match="read only"):
+        replay[0] = replay[1]
+
+
+@pytest.mark.parametrize("way", ["dumps", "state_dict"])
+def test_another_file_s_state_does_not_overwrite_the_data(
+    path: Path, tmp_path: Path, way: str
+) -> None:
+    other = tmp_path / "other.hdf5"
+    write_episodes(other, [make_episode(9 + i, n) for i, n in enumerate(LENGTHS)], env_args={})
+    replay, foreign = RobomimicExperienceReplay(path), RobomimicExperienceReplay(other)
+    before = replay[:].clone()
+    if way == "dumps":
+        foreign.dumps(tmp_path / "dump")
+        replay.loads(tmp_path / "dump")
+    else:
+        replay.load_state_dict(foreign.state_dict())
+    for data in (replay[:], RobomimicExperienceReplay(path)[:]):
+        assert torch.equal(data["object"], before["object"])
+
+
+@pytest.mark.parametrize("damage", ["shortened", "removed", "emptied"])
+def test_a_damaged_cache_is_made_anew(path: Path, damage: str) -> None:
+    replay = RobomimicExperienceReplay(path)
+    before = replay[:].clone()
+    memmap = replay.data_path / "data" / "object.memmap"
+    if damage == "shortened":
+        os.truncate(memmap, 16)
+    elif damage == "removed":
+        memmap.unlink()
+    else:
+        shutil.rmtree(replay.data_path)
+        replay.data_path.mkdir()
+    again = RobomimicExperienceReplay(path)[:]
+    assert torch.equal(again["object"], before["object"])
+
+
+def test_a_relative_path_outlives_the_working_directory(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(path.parent)
+    replay = RobomimicExperienceReplay(path.name)
+    monkeypatch.chdir(tmp_path.parent)
+    assert replay.metadata["episodes"][0] == "demo_0"
+    replay.delete()
+    assert not replay.data_path.exists()
+
+
+def test_statistics_of_vectors_are_kept_with_the_data(path: Path) -> None:
+    replay = RobomimicExperienceReplay(path, split="train")
+    statistics = replay.metadata["statistics"]
+    assert set(statistics) == {"action", "object"}  # neither images nor flags
+    values = np.concatenate([e.observations["object"] for e in made()[:3]])
+    np.testing.assert_allclose(statistics["object"]["loc"], values.mean(0))
+    np.testing.assert_allclose(statistics["object"]["scale"], values.std(0))
+
+
+def test_options_of_the_wrong_kind_are_named(path: Path) -> None:
+    with pytest.raises(ConfigError, match="observation_keys is 'object'; valid: a list"):
+        RobomimicExperienceReplay(path, observation_keys="object")
+    with pytest.raises(ConfigError, match="split is 3; valid: the name of a mask"):
+        RobomimicExperienceReplay(path, split=3)  # type: ignore[arg-type]
+    with pytest.raises(DataError, match="obs/depth: missing; valid: image, object"):
+        RobomimicExperienceReplay(path, observation_keys=["object", "depth"])
+
+
+def test_the_order_of_the_parts_asked_for_makes_no_other_folder(path: Path) -> None:
+    first = RobomimicExperienceReplay(path, observation_keys=["object", "image"])
+    second = RobomimicExperienceReplay(path, observation_keys=["image", "object", "image"])
+    assert first.data_path == second.data_path
+
+
+@pytest.mark.parametrize("split", [None, "train"])
+def test_dones_terminate_in_a_split_too(path: Path, split: str | None) -> None:
+    with h5py.File(path, "r+") as file:
+        for demo in file["data"].values():
+            del demo["terminated"]
+    replay = RobomimicExperienceReplay(path, split=split, dones_terminate=True)
+    episodes = 4 if split is None else 3
+    assert replay[:]["next", "terminated"].sum() == episodes
+    assert not replay[:]["next", "truncated"].any()
 
 
 # -- slices and trajectories -----------------------------------------------------------------------
@@ -409,8 +491,10 @@ def test_a_later_episode_s_fault_leaves_nothing_behind(
 
 
 def test_a_part_named_like_a_key_of_torchrl_s_is_refused(tmp_path: Path) -> None:
-    episode = make_episode(parts={"action": ((2,), "f8")})
-    write_episodes(tmp_path / "a.hdf5", [episode], env_args={})
+    write_file(tmp_path / "a.hdf5")
+    with h5py.File(tmp_path / "a.hdf5", "r+") as file:
+        for group in ("obs", "next_obs"):
+            file[f"data/demo_0/{group}/action"] = np.zeros((LENGTHS[0], 2))
     error = refusal(tmp_path / "a.hdf5", tmp_path / "root")
     assert error.key == "data/demo_0/obs/action"
 
@@ -492,7 +576,7 @@ def test_an_interrupt_leaves_nothing_behind(
     def interrupt(*args: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(datasets, "_flush", interrupt)
+    monkeypatch.setattr(datasets, "_statistics", interrupt)
     with pytest.raises(KeyboardInterrupt):
         RobomimicExperienceReplay(path, root=tmp_path / "root")
     assert entries(tmp_path / "root") == []
@@ -535,7 +619,7 @@ def convert_and_stop(path: str, root: str, ready: Any) -> None:
         ready.set()
         signal.pause()
 
-    datasets._flush = stop
+    datasets._statistics = stop
     RobomimicExperienceReplay(path, root=root)
 
 

@@ -515,6 +515,35 @@ def test_learning_from_people_names_what_is_missing(
     assert "Traceback" not in done.stderr
 
 
+def test_the_verdict_on_people_s_data_follows_from_the_interval(recipes: Any) -> None:
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    import learn_from_people
+
+    def rows(share: float, gain: float, noise: float) -> list[dict[str, Any]]:
+        return [
+            {
+                "share": share,
+                "training_seed": i % 2,
+                "return": 100 + i + gain + noise * (-1) ** (i // 2),
+                "success": i % 2,
+            }
+            for i in range(20)
+        ]
+
+    table = learn_from_people.comparison(
+        rows(0, 0, 0) + rows(0.1, 5, 1) + rows(0.2, -5, 1) + rows(0.3, 0.1, 5), [0, 0.1, 0.2, 0.3]
+    ).splitlines()
+    assert table[2] == "| 0% | 109.5 | 10 of 20 | | |"
+    assert [line.split("|")[-2].strip() for line in table[3:6]] == [
+        "helped",
+        "hurt",
+        "no difference to be seen",
+    ]
+    assert "+5.0 (" in table[3]
+    few = learn_from_people.comparison(rows(0, 0, 0)[:4] + rows(0.1, 5, 1)[:4], [0, 0.1])
+    assert "too few episodes" in few
+
+
 @pytest.mark.robosuite
 @pytest.mark.slow
 def test_learning_from_people_compares_every_share_and_goes_on(
@@ -535,7 +564,7 @@ def test_learning_from_people_compares_every_share_and_goes_on(
     ]
     run(tmp_path, learn_from_people.learn_from_people, *options)
     table = (tmp_path / "tables" / "human.md").read_text()
-    assert [line.split("|")[1].strip() for line in table.splitlines()[2:]] == ["0%", "100%"]
+    assert [line.split("|")[1].strip() for line in table.splitlines()[2:4]] == ["0%", "100%"]
     assert "0 of 2" in table
     assert "too few episodes" in table
     assert table in capsys.readouterr().out

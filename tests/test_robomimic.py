@@ -29,6 +29,8 @@ from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import (
     count_episodes,
     count_steps,
+    find_mask_problems,
+    find_oddities,
     keep_episode,
     open_episodes,
     read_kept_episode,
@@ -36,7 +38,7 @@ from torchrl_bmrl.data.robomimic import (
     write_episodes,
 )
 from torchrl_bmrl.data.schema import find_problems
-from torchrl_bmrl.errors import BMRLError, DataError
+from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
 
 Damage = Callable[[Any], None]
 DEMO = "data/demo_1"
@@ -243,14 +245,77 @@ def test_without_next_observations_the_last_step_is_lost(tmp_path: Path) -> None
         assert_identical(episode.rewards, original.rewards[:-1])
         assert_identical(episode.extras["states"], original.extras["states"][:-1])
         assert episode.terminated.tolist() == [False] * len(episode)
-    assert count_steps(path, ["demo_0", "demo_2"]) == LENGTHS[0] + LENGTHS[2] - 2
+    assert count_steps(path, read(path)) == sum(LENGTHS) - 4
+    (told,) = find_oddities(path)
+    assert "4 episodes have no next_obs, such as demo_0" in told
+
+
+def test_without_next_observations_a_step_that_terminates_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "a.hdf5"
+    original = make_episode(terminated=True)
+    write_episodes(path, [original], env_args={})
+    edit(path, remove("data/demo_0/next_obs"))
+    episode = read(path)["demo_0"]
+    assert_identical(episode.rewards, original.rewards)
+    assert episode.terminated[-1]
+    for name in PARTS:
+        assert_identical(episode.observations[name], original.observations[name])
+        after = np.append(original.observations[name][1:], original.observations[name][-1:], axis=0)
+        assert_identical(episode.next_observations[name], after)
+    assert count_steps(path, read(path)) == len(original)
 
 
 def test_steps_are_counted_over_the_episodes_named(path: Path) -> None:
-    assert count_steps(path, ["demo_0", "demo_2"]) == LENGTHS[0] + LENGTHS[2]
-    assert count_steps(path, []) == 0
+    episodes = read(path)
+    some = {name: episodes[name] for name in ("demo_0", "demo_2")}
+    assert count_steps(path, some) == LENGTHS[0] + LENGTHS[2]
+    assert count_steps(path, {}) == 0
     with pytest.raises(DataError, match=r"lift\.hdf5: data/demo_9/actions: missing"):
-        count_steps(path, ["demo_9"])
+        count_steps(path, {"demo_9": make_episode()})
+
+
+def test_every_faulty_mask_is_told(path: Path) -> None:
+    assert find_mask_problems(path) == find_oddities(path) == []
+    edit(
+        path,
+        put("mask/train", np.array([b"demo_0", b"demo_7"])),
+        put("mask/valid", np.array([b"demo_1", b"demo_1"])),
+    )
+    assert find_mask_problems(path) == [
+        ("mask/train", "row 1 names 'demo_7', which is not in the file"),
+        ("mask/valid", "row 1 names 'demo_1', again"),
+    ]
+
+
+def test_an_episode_to_train_on_and_to_hold_out_deserves_a_look(path: Path) -> None:
+    edit(path, put("mask/valid", np.array([b"demo_3", b"demo_1"])))
+    assert find_oddities(path) == ["1 episodes are in train and in valid, such as demo_1"]
+
+
+def test_what_could_not_be_trained_on_is_not_written(tmp_path: Path) -> None:
+    path, episode = tmp_path / "a.hdf5", make_episode()
+    bad = {
+        "not finite in row 0": replace(episode, rewards=np.full(5, np.nan)),
+        "names without '/'": replace(
+            episode, observations={"a/b": np.zeros(5)}, next_observations={"a/b": np.zeros(5)}
+        ),
+        "other names than actions": replace(episode, extras={"dones": np.zeros(5)}),
+    }
+    for message, faulty in bad.items():
+        with pytest.raises(DataError, match=message):
+            write_episodes(path, [episode, faulty], env_args={})
+    with pytest.raises(DataError, match="no episodes"):
+        write_episodes(path, [], env_args={})
+    with pytest.raises(ConfigError, match="mask 'train' has 1; valid: 0 to 0"):
+        write_episodes(path, [episode], env_args={}, masks={"train": [0, 1]})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_environment_metadata_must_be_an_object(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file["data"].attrs["env_args"] = "[1]"
+    with pytest.raises(DataError, match="env_args; valid: a JSON object"):
+        read_metadata(path)
 
 
 def test_dones_terminate_only_where_that_is_asked_for(path: Path) -> None:
@@ -426,7 +491,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 def test_a_folder_is_not_a_file(tmp_path: Path) -> None:
     (tmp_path / "lift.hdf5").mkdir()
-    assert "no such file" in str(refusal(tmp_path / "lift.hdf5"))
+    assert "a folder; valid: a file" in str(refusal(tmp_path / "lift.hdf5"))
 
 
 @pytest.mark.parametrize("content", [b"", b"not HDF5 at all\n" * 100], ids=["empty", "text"])

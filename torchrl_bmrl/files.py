@@ -71,13 +71,15 @@ def write_atomic(path: str | os.PathLike[str], data: str | bytes) -> None:
 
 
 @contextmanager
-def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+def new_folder(path: str | os.PathLike[str], *, exist_ok: bool = False) -> Iterator[Path]:
     """Yields a temporary folder that becomes ``path`` when the block succeeds.
 
     It lies beside ``path``, has a leading dot and is removed if the block raises.
 
     Args:
         path: must not exist; its parents are created.
+        exist_ok: another process may make the same folder meanwhile: it is kept, and this one's is
+            dropped.
 
     Raises:
         DataError: if ``path`` exists.
@@ -91,7 +93,7 @@ def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         ['a.txt']
     """
     path = Path(path)
-    if os.path.lexists(path):
+    if os.path.lexists(path) and not exist_ok:
         raise DataError(path, None, "exists already; valid: a new folder")
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
@@ -102,10 +104,13 @@ def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
             with file.open("r+b") as written:
                 # Without it a power cut after the rename may leave empty files in the folder.
                 os.fsync(written.fileno())
-        temporary.rename(path)
-    except BaseException:  # an interrupt must not leave the temporary folder either
+        try:
+            temporary.rename(path)
+        except OSError:
+            if not (exist_ok and path.is_dir()):
+                raise
+    finally:  # after an interrupt, too
         shutil.rmtree(temporary, ignore_errors=True)
-        raise
 
 
 def write_rows(path: str | os.PathLike[str], rows: Sequence[Mapping[str, Any]]) -> None:

@@ -80,6 +80,8 @@ def check(options: argparse.Namespace) -> int:
             summary = summarise(
                 source.episodes, prefix=source.prefix, bounds=source.bounds, look=look
             )
+        summary.problems = [*source.problems, *summary.problems]
+        summary.warnings = [*source.oddities, *summary.warnings]
         print("\n".join(describe(options.file, source, summary)))
     if relabelled:
         print("\n".join([RELABELLED, *relabelled]))

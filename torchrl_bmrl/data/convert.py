@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,6 +30,8 @@ class Source:
         prefix: of the names inside the file, for messages.
         bounds: of floating-point actions; ``None`` where the format has none.
         metadata: attributes of the file, ``env_args`` and ``masks`` among them.
+        problems: what is wrong beside the episodes: key and message.
+        oddities: what deserves a look beside them.
     """
 
     format: str
@@ -36,13 +39,17 @@ class Source:
     prefix: str = "data/"
     bounds: Bounds | None = (-1.0, 1.0)
     metadata: Mapping[str, Any] = field(default_factory=dict)
+    problems: Sequence[tuple[str, str]] = ()
+    oddities: Sequence[str] = ()
 
     @property
     def fps(self) -> float:
         """Steps per second [Hz]."""
-        kwargs = self.metadata.get("env_args", {}).get("env_kwargs", {})
-        known = self.metadata.get("fps") or kwargs.get("control_freq")
-        return float(known or CONTROL_FREQUENCY)
+        kwargs = self.metadata.get("env_args", {}).get("env_kwargs") or {}
+        for known in (self.metadata.get("fps"), kwargs.get("control_freq")):
+            if isinstance(known, int | float) and 0 < known < float("inf"):
+                return float(known)
+        return CONTROL_FREQUENCY
 
 
 def find_format(path: Path) -> str:
@@ -79,10 +86,13 @@ def open_source(
 
     Raises:
         DataError: for a missing or damaged data set.
-        ConfigError: for a robosuite file without ``task``, or a ``split`` of one without masks.
+        ConfigError: for a robosuite file without ``task``, and for options that another format has
+            no use for.
     """
     path = Path(path).expanduser()
     form = find_format(path)
+    if form != "robosuite" and (task is not None or tracking != 1.0):
+        raise ConfigError(f"task and tracking are for robosuite's demo.hdf5; {path} is {form}'s")
     if split is not None and form != "robomimic":
         raise ConfigError(f"split is {split!r}, but {path} is {form}'s, which has no masks")
     if form == "minari":
@@ -97,7 +107,13 @@ def open_source(
     elif form == "robomimic":
         metadata = robomimic.read_metadata(path)
         with robomimic.open_episodes(path, split=split) as episodes:
-            yield Source(format=form, episodes=episodes, metadata=metadata)
+            yield Source(
+                format=form,
+                episodes=episodes,
+                metadata=metadata,
+                problems=robomimic.find_mask_problems(path),
+                oddities=robomimic.find_oddities(path),
+            )
     else:
         if task is None:
             raise ConfigError(
@@ -126,7 +142,7 @@ def convert(
         source: an HDF5 file in robomimic's layout or of robosuite, or a Minari data set's folder.
         target: what to write: a file for robomimic, a folder for Minari and LeRobot.
         to: ``"robomimic"``, ``"minari"`` or ``"lerobot"``.
-        task: of a robosuite file; the text of LeRobot's task otherwise.
+        task: whose scene a robosuite ``demo.hdf5`` was recorded in.
         tracking: see :func:`torchrl_bmrl.data.robosuite.open_episodes`.
         split: name of a mask of a file in robomimic's layout; ``None`` for all episodes.
         report: called with 1 after every episode.
@@ -139,27 +155,28 @@ def convert(
     if to not in TARGETS:
         raise UnknownNameError("format", to, TARGETS)
     source, target = Path(source).expanduser(), Path(target).expanduser()
-    if target.exists():
-        raise DataError(target, None, "exists; valid: a new name")
     with open_source(source, task=task, tracking=tracking, split=split) as data:
+        for key, message in data.problems:
+            raise DataError(source, key, message)
         episodes = _checked(source, data, report)
         try:
-            _write(target, to, data, episodes, task)
+            if os.path.lexists(target):
+                raise DataError(target, None, "exists; valid: a new name")
+            _write(target, to, data, episodes)
         except BMRLError:
             raise
         except (OSError, RuntimeError) as error:  # RuntimeError: how h5py reports a full disk
             raise DataError(target, None, f"cannot be written ({error})") from error
 
 
-def _write(
-    target: Path, to: str, data: Source, episodes: Iterator[Episode], task: str | None
-) -> None:
+def _write(target: Path, to: str, data: Source, episodes: Iterator[Episode]) -> None:
     env_args = data.metadata.get("env_args", {})
-    name = task or data.metadata.get("task") or env_args.get("env_name") or target.name
+    name = data.metadata.get("task") or env_args.get("env_name") or target.name
     if to == "robomimic":
-        names = list(data.episodes)
+        # Of one mask's episodes the other masks keep what is left of theirs.
+        positions = {name: i for i, name in enumerate(data.episodes)}
         masks = {
-            mask: [names.index(name) for name in chosen if name in names]
+            mask: [positions[name] for name in chosen if name in positions]
             for mask, chosen in data.metadata.get("masks", {}).items()
         }
         attributes = {

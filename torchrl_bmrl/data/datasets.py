@@ -6,12 +6,13 @@ import hashlib
 import json
 import os
 import shutil
-import uuid
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict import TensorDict
+from torch import Tensor
 from torchrl.collectors.utils import split_trajectories
 from torchrl.data import ImmutableDatasetWriter, TensorStorage
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
@@ -22,10 +23,36 @@ from torchrl.envs.transforms import Transform
 from torchrl_bmrl.data.episodes import Episode, as_tensordict
 from torchrl_bmrl.data.robomimic import count_steps, open_episodes, read_metadata
 from torchrl_bmrl.data.schema import check_episode, layout_of
-from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
+from torchrl_bmrl.files import new_folder
 
 LAYOUT_VERSION = 1
 """Part of a cache's name: another version converts anew."""
+
+
+class FixedStorage(TensorStorage):
+    """Data that belong to a file: nothing writes to them, and a dump leaves them where they are."""
+
+    def set(self, *args: Any, **kwargs: Any) -> None:
+        """Refuses.
+
+        Raises:
+            BMRLError: always.
+        """
+        raise BMRLError("the data of a file are read only; copy them: replay[:].clone()")
+
+    def dumps(self, path: str | Path) -> None:
+        """Writes nothing: the file has the data."""
+
+    def loads(self, path: str | Path) -> None:
+        """Reads nothing: the data are there."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing."""
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Takes nothing."""
 
 
 class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
@@ -60,6 +87,7 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
     Raises:
         DataError: naming file, key and row for data that cannot be trained on (see
             :func:`~torchrl_bmrl.data.schema.find_problems`), and if the folder cannot be written.
+        ConfigError: for invalid options.
 
     Example:
         >>> import torchrl_bmrl.data  # registers the prefix
@@ -84,20 +112,28 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
         prefetch: int | None = None,
         transform: Transform | None = None,
     ) -> None:
+        if isinstance(observation_keys, str):
+            raise ConfigError(f"observation_keys is {observation_keys!r}; valid: a list of names")
+        if not isinstance(split, str | None):
+            raise ConfigError(f"split is {split!r}; valid: the name of a mask, or None")
         self.dataset_id = str(dataset_id)
-        source = Path(dataset_id).expanduser()
-        self.root = source.parent if root is None else Path(root).expanduser()
+        # Absolute: the working directory may change before the folder is looked at again.
+        source = Path(dataset_id).expanduser().absolute()
+        self.root = source.parent if root is None else Path(root).expanduser().absolute()
         options = {
             "split": split,
-            "observation_keys": None if observation_keys is None else list(observation_keys),
+            # In one order, so that one folder serves them all.
+            "observation_keys": None if observation_keys is None else sorted(set(observation_keys)),
             "dones_terminate": dones_terminate,
         }
         self._path = self.root / f"{source.stem}-{_digest(source, options, split_trajs)}"
         if not self._is_downloaded():
+            # What is there and not whole was damaged after it was written.
+            shutil.rmtree(self._path, ignore_errors=True)
             _convert(source, self._path, options, split_trajs)
         data = TensorDict.load_memmap(self._path / "data")
         super().__init__(
-            storage=TensorStorage(data),
+            storage=FixedStorage(data),
             sampler=sampler,
             writer=writer or ImmutableDatasetWriter(),
             collate_fn=collate_fn,
@@ -118,11 +154,21 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
         return self._path
 
     def _is_downloaded(self) -> bool:
-        return self._path.is_dir()
+        try:
+            sizes = self.metadata["sizes"]
+            return all((self._path / name).stat().st_size == size for name, size in sizes.items())
+        except (OSError, ValueError, KeyError):
+            return False
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """Attributes of the file, its ``env_args`` and the names of the ``episodes``, in order."""
+        """What is known of the data beside them.
+
+        Attributes of the file with its ``env_args`` and ``masks``; ``episodes``, their names in
+        order; ``statistics``, mean (``loc``) and standard deviation (``scale``) of the actions and
+        of every part of the observation that is a vector of floating-point numbers, ready for
+        ``ObservationNorm``.
+        """
         return json.loads((self._path / "metadata.json").read_text())
 
 
@@ -142,32 +188,36 @@ def _digest(source: Path, options: Mapping[str, Any], split_trajs: bool) -> str:
 
 def _convert(source: Path, target: Path, options: Mapping[str, Any], split_trajs: bool) -> None:
     """Converts a file into a folder that appears whole, or not at all."""
-    temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
-        temporary.mkdir(parents=True)
-        with open_episodes(source, extras=["successes"], **options) as episodes:
-            steps = count_steps(source, episodes)
-            _write_rows(temporary / "data", source, episodes, steps)
-            metadata = read_metadata(source) | {"episodes": list(episodes)}
-        if split_trajs:
-            _split(temporary / "data")
-        (temporary / "metadata.json").write_text(json.dumps(metadata, default=str))
-        _flush(temporary)
-        try:
-            temporary.rename(target)
-        except OSError:
-            if not target.is_dir():  # otherwise another process was faster, with the same data
-                raise
+        with new_folder(target, exist_ok=True) as folder:
+            with open_episodes(
+                source, extras=["successes"], attributes=False, **options
+            ) as episodes:
+                steps = count_steps(source, episodes)
+                data = _write_rows(folder / "data", source, episodes, steps)
+                metadata = read_metadata(source) | {"episodes": list(episodes)}
+            metadata["statistics"] = _statistics(data)
+            if split_trajs:
+                _split(folder / "data")
+            sizes = {
+                str(file.relative_to(folder)): file.stat().st_size
+                for file in sorted(folder.rglob("*"))
+                if file.is_file()
+            }
+            text = json.dumps(metadata | {"sizes": sizes}, default=str)
+            (folder / "metadata.json").write_text(text)
     except OSError as error:
-        message = (
+        raise DataError(
+            source,
+            None,
             f"cannot be converted into {target.parent} ({error}); valid: root=, a folder with "
-        )
-        raise DataError(source, None, message + "space that can be written") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+            "space that can be written",
+        ) from error
 
 
-def _write_rows(path: Path, source: Path, episodes: Mapping[str, Episode], steps: int) -> None:
+def _write_rows(
+    path: Path, source: Path, episodes: Mapping[str, Episode], steps: int
+) -> TensorDict:
     """Writes episodes one after the other into memory-mapped tensors.
 
     Only one episode is in memory at a time, however large the data set.
@@ -192,6 +242,17 @@ def _write_rows(path: Path, source: Path, episodes: Mapping[str, Episode], steps
             data = _allocate(rows[:1].expand(steps), path)
         data[start : start + len(rows)] = rows
         start += len(rows)
+    return data
+
+
+def _statistics(data: TensorDict) -> dict[str, dict[str, list[float]]]:
+    """Mean and standard deviation of the vectors among the observation's parts and the actions."""
+    statistics = {}
+    for key, part in data.items():
+        if isinstance(part, Tensor) and part.is_floating_point() and part.ndim == 2:
+            scale, loc = torch.std_mean(part.double(), dim=0, correction=0)
+            statistics[key] = {"loc": loc.tolist(), "scale": scale.tolist()}
+    return statistics
 
 
 def _split(path: Path) -> None:
@@ -215,11 +276,3 @@ def _allocate(data: TensorDict, path: Path) -> TensorDict:
             with file.open("r+b") as handle:
                 os.posix_fallocate(handle.fileno(), 0, size)
     return mapped
-
-
-def _flush(path: Path) -> None:
-    # A power cut after the rename must not leave empty files under the final name.
-    for file in path.rglob("*"):
-        if file.is_file():
-            with file.open("rb") as handle:
-                os.fsync(handle.fileno())

@@ -24,7 +24,7 @@ def open_file(path: str | Path) -> h5py.File:
     """
     path = Path(path)
     if not path.is_file():
-        raise DataError(path, None, "no such file")
+        raise DataError(path, None, "a folder; valid: a file" if path.is_dir() else "no such file")
     try:
         with path.open("rb") as file:
             pointer = file.read(23) == b"version https://git-lfs"
@@ -52,7 +52,9 @@ def read_names(path: str | Path, file: h5py.File, key: str) -> list[str]:
 
 def _natural(name: str) -> list[tuple[int, str]]:
     # Numbers by value, all else as text: (0, text) and (number, "") compare with each other.
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+    return [
+        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)
+    ]
 
 
 def read_array(path: str | Path, file: h5py.File, key: str) -> np.ndarray:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_bmrl.data.episodes import Episode, join_observations
-from torchrl_bmrl.data.schema import check_episode, layout_of
+from torchrl_bmrl.data.schema import check_episode, check_fps, layout_of
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
 from torchrl_bmrl.files import new_folder
 
@@ -62,8 +62,7 @@ def write_episodes(
         ConfigError: if ``fps`` is not positive or ``task`` is empty.
         BMRLError: if pyarrow is not installed.
     """
-    if not 0 < fps < float("inf"):
-        raise ConfigError(f"fps is {fps}; valid: a positive number")
+    check_fps(fps)
     if not task:
         raise ConfigError("task is empty; valid: what the robot does, in words")
     _require_pyarrow()
@@ -122,13 +121,17 @@ def _columns(path: Path, name: str, episode: Episode) -> dict[str, np.ndarray]:
     steps = len(episode)
     parts = [part.reshape(steps, -1) for part in episode.observations.values()]
     columns = {
-        "observation.state": np.concatenate(parts, axis=1, dtype=np.float32),
+        "observation.state": np.concatenate(parts, axis=1).astype(np.float32),
         "action": episode.actions.reshape(steps, -1).astype(np.float32),
         "next.reward": episode.rewards.astype(np.float32),
         "next.done": np.arange(steps) == steps - 1,
     }
     if "successes" in episode.extras:
         columns["next.success"] = episode.extras["successes"].astype(bool)
+    for key, column in columns.items():
+        if not (finite := np.isfinite(column)).all():
+            row = int(np.argwhere(~finite)[0][0])
+            raise DataError(path, f"{name}/{key}", f"row {row} is too large for float32")
     # LeRobot has no list of one number.
     return {key: x[:, 0] if x.shape[1:] == (1,) else x for key, x in columns.items()}
 

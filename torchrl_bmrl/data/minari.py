@@ -41,7 +41,7 @@ from torchrl_bmrl.data.hdf5 import (
     read_names,
     write_attributes,
 )
-from torchrl_bmrl.data.schema import check_episode, layout_of
+from torchrl_bmrl.data.schema import check_episode, check_fps, layout_of
 from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.files import new_folder
 
@@ -78,10 +78,13 @@ def write_episodes(
     Raises:
         DataError: if the folder exists or its name is no id of Minari's, without episodes, and for
             an episode that cannot be kept: naming episode, key and row.
+        ConfigError: if ``fps`` is not positive.
         BMRLError: if minari is not installed.
     """
     path = Path(path)
     dataset_id = _dataset_id(path)
+    if fps is not None:
+        check_fps(fps)
     try:
         from minari import __version__ as version
         from minari.dataset.minari_storage import MinariStorage
@@ -128,7 +131,7 @@ def _dataset_id(path: Path) -> str:
             path,
             None,
             "no id of Minari's; valid: <namespace>/<name>-v<number> of letters, digits, '-' and "
-            "'_', such as sawyer/lift-v0",
+            "'_', at least two of them in the namespace, such as sawyer/lift-v0",
         )
     return f"{whole.parent.name}/{whole.name}"
 

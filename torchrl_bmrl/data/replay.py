@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from math import isfinite
+from numbers import Integral
 from typing import Any
 
 import torch
@@ -201,9 +202,13 @@ def _make_buffer(
     _check_count("batch_size", batch_size, 1)
     _check_count("prefetch", prefetch, 0)
     end = 0
-    for data in datasets:
-        start, end = end, end + len(data)
-        storage.set(slice(start, end), data)
+    try:
+        for data in datasets:
+            start, end = end, end + len(data)
+            storage.set(slice(start, end), data)
+    except (OSError, RuntimeError) as error:
+        where = scratch_dir or "the temporary folder"
+        raise BMRLError(f"the data cannot be kept in {where} ({error})") from error
     return DatasetBuffer(
         storage=storage,
         sampler=TaskSampler(sizes, weights=weights, flat=flat, device=storage.device),
@@ -227,7 +232,7 @@ def _own_generator(device: torch.device) -> torch.Generator:
 
 
 def _check_count(name: str, value: Any, least: int) -> None:
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
         raise ConfigError(f"{name} is {value!r}; valid: at least {least}, an integer")
 
 
@@ -241,11 +246,14 @@ def _check_device(device: Device) -> torch.device:
 
 
 def _check_weights(weights: Sequence[float], count: int, *, zero: bool) -> list[float]:
-    values = [float(weight) for weight in weights]
+    try:
+        values = [float(weight) for weight in weights]
+    except (TypeError, ValueError):
+        values = []
     in_range = all(isfinite(x) and (x >= 0 if zero else x > 0) for x in values)
     if len(values) != count or not in_range or not any(values):
         kind = "none negative, one positive" if zero else "all positive"
-        message = f"weights is {values}; valid: {count} finite numbers, one per data set, {kind}"
+        message = f"weights is {weights}; valid: {count} finite numbers, one per data set, {kind}"
         raise ConfigError(message)
     return [value / max(values) for value in values]
 
@@ -254,6 +262,8 @@ def _check_datasets(datasets: Sequence[TensorDictBase]) -> list[TensorDictBase]:
     datasets = list(datasets)
     if not datasets:
         raise BMRLError("no data sets; valid: at least one")
+    if wrong := [data for data in datasets if not isinstance(data, TensorDictBase)]:
+        raise BMRLError(f"a data set is a {type(wrong[0]).__name__}; valid: TensorDicts")
     for number, data in enumerate(datasets):
         _check_data(data, f"data set {number}")
         given, expected = _layout(data), _layout(datasets[0])

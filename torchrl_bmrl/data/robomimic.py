@@ -22,6 +22,7 @@ import json
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +39,11 @@ from torchrl_bmrl.data.hdf5 import (
     read_strings,
     write_attributes,
 )
-from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.data.schema import check_episode, layout_of
+from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.files import atomic_path, write_atomic
 
+MASKS = ("train", "valid")
 STEP_KEYS = ("actions", "rewards", "dones", "terminated", "obs", "next_obs")
 
 
@@ -52,6 +55,7 @@ def open_episodes(
     observation_keys: Iterable[str] | None = None,
     extras: Iterable[str] | None = None,
     dones_terminate: bool = False,
+    attributes: bool = True,
 ) -> Iterator[Mapping[str, Episode]]:
     """Episodes of a file by name, each read when it is asked for.
 
@@ -63,18 +67,29 @@ def open_episodes(
             row of numbers for each step.
         dones_terminate: what ``dones`` means at the last step of files without ``terminated``:
             robomimic's simulators never terminate, so that by default an episode's end truncates.
+        attributes: whether to read those of the demonstrations.
+
+    Files without ``next_obs`` take the next step's ``obs``. Their last step is left out, unless it
+    terminates: then what follows does not matter, and its own ``obs`` stands for it.
 
     Raises:
         DataError: naming file and key, for a missing or damaged file, a mask that is missing or
             names a demonstration that is, and, when an episode is read, for missing keys.
-            Files without ``next_obs`` take the next step's ``obs`` and lose the last step.
+        ConfigError: if ``observation_keys`` is one text.
     """
+    if isinstance(observation_keys, str):
+        raise ConfigError(f"observation_keys is {observation_keys!r}; valid: a list of names")
     parts = None if observation_keys is None else list(observation_keys)
     wanted = None if extras is None else set(extras)
     with open_file(path) as file:
 
         def read(name: str) -> Episode:
-            return _read_episode(path, file, f"data/{name}", parts, wanted, dones_terminate)
+            episode = _read_episode(path, file, f"data/{name}", parts, wanted, dones_terminate)
+            if not attributes:
+                return episode
+            told = read_attributes(path, file, f"data/{name}")
+            told.pop("num_samples", None)
+            return replace(episode, attributes=told)
 
         yield LazyEpisodes(episode_names(path, file, split), read)
 
@@ -91,16 +106,55 @@ def episode_names(path: str | Path, file: h5py.File, split: str | None) -> list[
         if split not in masks:
             valid = ", ".join(masks) or "none; the file has no masks"
             raise DataError(path, f"mask/{split}", f"missing; valid masks: {valid}")
-        chosen = read_strings(path, file, f"mask/{split}")
-        for row, name in enumerate(chosen):
-            if name not in names or name in chosen[:row]:
-                fault = "again" if name in names else "which is not in the file"
-                message = f"row {row} names {name!r}, {fault}"
-                raise DataError(path, f"mask/{split}", message)
-        names = chosen
+        names = _read_mask(path, file, split, set(names))
     if not names:
         raise DataError(path, f"mask/{split}" if split else "data", "no demonstrations")
     return names
+
+
+def _read_mask(path: str | Path, file: h5py.File, mask: str, known: set[str]) -> list[str]:
+    names = read_strings(path, file, f"mask/{mask}")
+    seen: set[str] = set()
+    for row, name in enumerate(names):
+        if name not in known or name in seen:
+            fault = "again" if name in known else "which is not in the file"
+            raise DataError(path, f"mask/{mask}", f"row {row} names {name!r}, {fault}")
+        seen.add(name)
+    return names
+
+
+def find_mask_problems(path: str | Path) -> list[tuple[str, str]]:
+    """What is wrong with each mask of a file: key and message."""
+    problems = []
+    with open_file(path) as file:
+        known = set(read_names(path, file, "data"))
+        for mask in _read_masks(path, file):
+            try:
+                _read_mask(path, file, mask, known)
+            except DataError as error:
+                problems.append((error.key or "mask", error.message))
+    return problems
+
+
+def find_oddities(path: str | Path) -> list[str]:
+    """What deserves a look in a file beside its episodes: warnings."""
+    oddities = []
+    with open_file(path) as file:
+        names = read_names(path, file, "data")
+        cut = [name for name in names if "next_obs" not in read_names(path, file, f"data/{name}")]
+        if cut:
+            oddities.append(
+                f"{len(cut)} episodes have no next_obs, such as {cut[0]}: where they do not "
+                "terminate, their last step is left out"
+            )
+        masks = {
+            mask: set(read_strings(path, file, f"mask/{mask}"))
+            for mask in MASKS
+            if mask in _read_masks(path, file)
+        }
+        if both := sorted(set.intersection(*masks.values())) if len(masks) == len(MASKS) else []:
+            oddities.append(f"{len(both)} episodes are in train and in valid, such as {both[0]}")
+    return oddities
 
 
 def _read_masks(path: str | Path, file: h5py.File) -> list[str]:
@@ -118,6 +172,11 @@ def _read_episode(
     present = read_names(path, file, demo)
     if parts is None:
         parts = read_names(path, file, f"{demo}/obs")
+    else:
+        valid = read_names(path, file, f"{demo}/obs")
+        for part in parts:
+            if part not in valid:
+                raise DataError(path, f"{demo}/obs/{part}", f"missing; valid: {', '.join(valid)}")
     observations = {part: read_array(path, file, f"{demo}/obs/{part}") for part in parts}
     actions = read_array(path, file, f"{demo}/actions")
     if not actions.ndim:
@@ -149,9 +208,15 @@ def _read_episode(
     if "next_obs" in present:
         after = {part: read_array(path, file, f"{demo}/next_obs/{part}") for part in parts}
     else:
-        after = {part: array[1:] for part, array in observations.items()}
-        observations = {part: array[:-1] for part, array in observations.items()}
-        steps = {key: array[:-1] for key, array in steps.items()}
+        for key, array in {**steps, **observations}.items():
+            if not array.ndim:
+                raise DataError(path, f"{demo}/{key}", "one number; valid: a row for each step")
+        if steps["terminated"][-1:].any():
+            after = {part: np.append(x[1:], x[-1:], axis=0) for part, x in observations.items()}
+        else:
+            after = {part: array[1:] for part, array in observations.items()}
+            observations = {part: array[:-1] for part, array in observations.items()}
+            steps = {key: array[:-1] for key, array in steps.items()}
     return Episode(
         observations=observations,
         next_observations=after,
@@ -159,11 +224,6 @@ def _read_episode(
         rewards=steps.pop("rewards"),
         terminated=steps.pop("terminated"),
         extras=steps,
-        attributes={
-            key: value
-            for key, value in read_attributes(path, file, demo).items()
-            if key != "num_samples"
-        },
     )
 
 
@@ -206,6 +266,8 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
         attributes["env_args"] = json.loads(attributes.get("env_args", "{}"))
     except (TypeError, ValueError) as error:
         raise DataError(path, "data", f"attribute env_args is not JSON ({error})") from error
+    if not isinstance(attributes["env_args"], dict):
+        raise DataError(path, "data", "attribute env_args; valid: a JSON object")
     return attributes
 
 
@@ -219,20 +281,26 @@ def count_episodes(path: str | Path) -> int:
         return len(read_names(path, file, "data"))
 
 
-def count_steps(path: str | Path, names: Iterable[str]) -> int:
-    """Steps of some demonstrations together, without reading them.
+def count_steps(path: str | Path, episodes: Mapping[str, Episode]) -> int:
+    """Steps of the episodes of a file together, without reading what need not be read.
+
+    Args:
+        path: the file.
+        episodes: of :func:`open_episodes`.
 
     Raises:
         DataError: if the file is damaged or lacks the actions of one.
     """
     total = 0
     with open_file(path) as file:
-        for name in names:
+        for name in episodes:
             key = f"data/{name}/actions"
             try:
-                total += len(file[key]) - ("next_obs" not in file[f"data/{name}"])
+                whole = "next_obs" in file[f"data/{name}"]
+                total += len(file[key]) if whole else 0
             except DAMAGE as error:
                 raise DataError(path, key, f"missing or unreadable ({error})") from error
+            total += 0 if whole else len(episodes[name])
     return total
 
 
@@ -249,7 +317,7 @@ def write_episodes(
     Every array carries checksums, and so do names and shapes: damage is found when it is read.
 
     Args:
-        path: the HDF5 file.
+        path: the HDF5 file, which replaces one that is there.
         episodes: in order, named ``demo_0``, ``demo_1``, ...
         env_args: robomimic's environment metadata: ``env_name``, ``type``, ``env_version`` and
             ``env_kwargs``.
@@ -257,7 +325,9 @@ def write_episodes(
         masks: positions of the episodes of each mask, such as ``{"train": range(60)}``.
 
     Raises:
-        DataError: if an extra is named like one of the layout's own arrays.
+        DataError: for an episode that could not be trained on, without episodes, and if an extra is
+            named like one of the layout's own arrays.
+        ConfigError: if a mask has a position that no episode has.
     """
     # HDF5's default structures have no checksums, these have; "latest" could only be read by the
     # very version that wrote it.
@@ -266,20 +336,35 @@ def write_episodes(
         data = file.create_group("data")
         names: list[str] = []
         total = 0
+        layout = None
         for i, episode in enumerate(episodes):
             names.append(f"demo_{i}")
-            for key in episode.extras:
-                if key.split("/")[0] in STEP_KEYS:
-                    message = f"an extra; valid: other names than {', '.join(STEP_KEYS)}"
-                    raise DataError(path, f"data/{names[-1]}/{key}", message)
+            _check_names(path, f"data/{names[-1]}", episode)
+            check_episode(path, f"data/{names[-1]}", episode, layout=layout)
+            layout = layout or layout_of(episode)
             _write_episode(data.create_group(names[-1]), episode)
             total += len(episode)
+        if not names:
+            raise DataError(path, None, "no episodes; valid: at least one")
         texts = {"env_args": json.dumps(dict(env_args))}
         write_attributes(data, {"total": total, **texts, **(attributes or {})})
         for name, positions in (masks or {}).items():
             # Not as file["mask/..."]: a group made on the way carries the time of day.
+            positions = list(positions)
+            if wrong := [i for i in positions if not 0 <= i < len(names)]:
+                raise ConfigError(f"mask {name!r} has {wrong[0]}; valid: 0 to {len(names) - 1}")
             mask = np.array([names[i] for i in positions], dtype="S")
             _write_array(file.require_group("mask"), name, mask)
+
+
+def _check_names(path: str | Path, demo: str, episode: Episode) -> None:
+    for key in episode.extras:
+        if key in STEP_KEYS:
+            message = f"an extra; valid: other names than {', '.join(STEP_KEYS)}"
+            raise DataError(path, f"{demo}/{key}", message)
+    for key in [*episode.extras, *episode.observations]:
+        if "/" in key:
+            raise DataError(path, f"{demo}/{key}", "valid: names without '/'")
 
 
 def _write_episode(demo: h5py.Group, episode: Episode) -> None:

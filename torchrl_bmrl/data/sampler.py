@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import LazyMemmapStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
-from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.errors import BMRLError, DataError
 
 Device = torch.device | str | None
 
@@ -115,14 +116,35 @@ class MemmapStorage(LazyMemmapStorage):
 
 
 class DatasetBuffer(TensorDictReplayBuffer):
-    """Refuses data sets of other sizes before they overwrite its storage."""
+    """Keeps its data and draws without pickle; samples that were prepared ahead are left out."""
+
+    def dumps(self, path: str | Path) -> None:
+        """Writes data, sampler and the buffer's own generator, if it has one, to a folder."""
+        path = Path(path).absolute()
+        path.mkdir(parents=True, exist_ok=True)
+        self.storage.dumps(path / "storage")
+        self.sampler.dumps(path / "sampler")
+        if self._rng is not None:
+            state = TensorDict({"rng_state": self._rng.get_state().clone()}, [])
+            state.memmap(path / "rng_state")
 
     def loads(self, path: str | Path) -> None:
-        """Reads what ``dumps`` wrote, for data sets of the same sizes."""
-        self.sampler.loads(Path(path) / "sampler")
-        super().loads(path)
+        """Reads what :meth:`dumps` wrote, for data sets of the same sizes.
+
+        Raises:
+            DataError: if there is no such folder, or one of other data.
+            BMRLError: for data sets of other sizes.
+        """
+        path = Path(path).absolute()
+        try:
+            self.sampler.loads(path / "sampler")  # before the storage is overwritten
+            self.storage.loads(path / "storage")
+            if self._rng is not None and (path / "rng_state").exists():
+                self._rng.set_state(TensorDict.load_memmap(path / "rng_state")["rng_state"])
+        except (OSError, RuntimeError, KeyError) as error:
+            raise DataError(path, None, f"not a dump of these data ({error})") from error
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Takes over what ``state_dict`` gave, for data sets of the same sizes."""
         self.sampler.load_state_dict(state_dict["_sampler"])
-        super().load_state_dict(state_dict)
+        super().load_state_dict({**state_dict, "_prefetch_state": None})

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from torchrl_bmrl.data.episodes import RESERVED, Episode
-from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.errors import ConfigError, DataError
 
 OBSERVATION_SHAPES: dict[str, int] = {
     "robot0_joint_pos": 7,
@@ -26,6 +26,8 @@ ACTION_DIM = 7
 ACTION_TOLERANCE = 1e-6
 SATURATED = 0.999
 """An action of this size counts as being at its bound."""
+
+FLOAT32 = float(np.finfo(np.float32).max)
 
 Layout = dict[str, tuple[tuple[int, ...], np.dtype]]
 Bounds = tuple[float, float]
@@ -91,7 +93,7 @@ def find_problems(
         yield "obs", "no part of an observation; valid: at least one"
     faulty, shared = set(), layout_of(episode)
     for key, array in arrays.items():
-        problem = _array_problem(key, array, steps)
+        problem = _array_problem(key, array, steps, trained=key in shared)
         if problem is None and layout is not None and key in shared:
             problem = _layout_problem(key, array, layout)
         if problem is not None:
@@ -116,7 +118,7 @@ def find_problems(
                 f"{after.dtype} of shape {after.shape} where obs has {part.dtype} of {part.shape}",
             )
     yield from _flag_problems(episode, steps)
-    if bounds is not None and episode.actions.dtype.kind == "f":
+    if bounds is not None and episode.actions.dtype.kind == "f" and episode.actions.ndim:
         outside = np.argwhere(
             (episode.actions < bounds[0] - ACTION_TOLERANCE)
             | (episode.actions > bounds[1] + ACTION_TOLERANCE)
@@ -128,15 +130,20 @@ def find_problems(
                 yield "actions", f"{value} in row {outside[0][0]} is outside {list(bounds)}"
 
 
-def _array_problem(key: str, array: np.ndarray, steps: int) -> str | None:
+def _array_problem(key: str, array: np.ndarray, steps: int, *, trained: bool) -> str | None:
     if array.dtype.kind not in "biuf":
         return f"dtype {array.dtype}; valid: numbers"
+    if trained and array.dtype.itemsize > 8:
+        return f"dtype {array.dtype}; valid: numbers of at most 64 bits"
     if key in ("rewards", "terminated", "successes") and array.shape != (steps,):
         return f"shape {array.shape}; valid: ({steps},)"
     if array.ndim == 0 or len(array) != steps:
         return f"shape {array.shape}; valid: ({steps}, ...), as many rows as the others"
+    if 0 in array.shape:
+        return f"shape {array.shape}; valid: rows of at least one number"
     if array.dtype.kind == "f":
-        finite = np.isfinite(array)
+        # What trains is float32: larger numbers would be infinite there.
+        finite = np.abs(array) <= FLOAT32 if key in ("actions", "rewards") else np.isfinite(array)
         if not finite.all():
             return f"a value that is not finite in row {int(np.argwhere(~finite)[0][0])}"
     return None
@@ -195,6 +202,16 @@ def check_episode(
                 f" ({len(problems) - 1} more: `python -m torchrl_bmrl.data check` lists them)"
             )
         raise DataError(path, f"{name}/{key}", message)
+
+
+def check_fps(fps: float) -> None:
+    """Refuses a number of steps per second that is none.
+
+    Raises:
+        ConfigError: naming the value.
+    """
+    if not isinstance(fps, int | float) or not 0 < fps < float("inf"):
+        raise ConfigError(f"fps is {fps!r}; valid: a positive number")
 
 
 @dataclass
