@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +110,17 @@ def test_lerobot_gets_the_control_rate_and_the_task_of_the_file(
     assert told["task"] == "lift a cube"
 
 
+def test_a_control_rate_that_nobody_tells_is_asked_for(path: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    pytest.importorskip("minari")
+    with pytest.raises(ConfigError, match="--fps"):
+        convert(path, tmp_path / "le", to="lerobot")
+    convert(path, tmp_path / "le", to="lerobot", fps=10)
+    assert json.loads((tmp_path / "le" / "meta" / "info.json").read_text())["fps"] == 10
+    convert(path, tmp_path / "sawyer" / "a-v0", to="minari")
+    assert "fps" not in minari.read_metadata(tmp_path / "sawyer" / "a-v0")
+
+
 def test_the_control_rate_survives_minari(tmp_path: Path) -> None:
     pytest.importorskip("minari")
     minari.write_episodes(tmp_path / "sawyer" / "a-v0", [make_episode()], fps=25.0)
@@ -139,7 +151,7 @@ def test_a_bad_episode_stops_a_conversion_and_leaves_nothing(
     before = path.read_bytes()
     target = tmp_path / "out" / "a-v0"
     with pytest.raises(DataError) as caught:
-        convert(path, target, to=to)
+        convert(path, target, to=to, fps=20)
     assert str(caught.value).startswith(f"{path}: data/demo_2/")
     assert list(target.parent.glob("*")) + list(target.parent.glob(".*")) == []
     assert path.read_bytes() == before
@@ -225,7 +237,7 @@ def test_check_lists_everything_that_is_wrong_and_fails(path: Path, capsys: Any)
         "data/demo_2/actions: 7.0 in row 3 is outside [-1.0, 1.0]",
         "data/demo_2/rewards: a value that is not finite in row 1",
         "data/demo_3/obs/goal_pos: a value that is not finite in row 0",
-        "3 errors",
+        "wrong: 3",
     ):
         assert message in told.err
 
@@ -245,7 +257,7 @@ def test_a_missing_package_is_named_with_the_extra_that_brings_it(
     for package, to in (("minari", "minari"), ("pyarrow.parquet", "lerobot")):
         monkeypatch.setitem(sys.modules, package, None)
         with pytest.raises(BMRLError, match=r"torchrl_bmrl\[data\]"):
-            convert(path, tmp_path / "out" / "a-v0", to=to)
+            convert(path, tmp_path / "out" / "a-v0", to=to, fps=20)
     assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
 
 

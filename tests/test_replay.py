@@ -19,7 +19,7 @@ from torchrl_bmrl.data import (
     replay,
     with_previous,
 )
-from torchrl_bmrl.errors import BMRLError, ConfigError
+from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
 
 SIZES = (30, 5, 12)
 
@@ -310,6 +310,30 @@ def test_data_sets_of_other_sizes_are_not_loaded(
     with pytest.raises(BMRLError, match=r"of \[30, 5, 12\] transitions; valid: "):
         copy_state(way, multi_task(), other, tmp_path)
     assert (other[:] == before).all()
+
+
+@every_buffer
+@pytest.mark.parametrize("prefetch", [(0, 2), (2, 0), (1, 1)])
+@pytest.mark.parametrize("way", ["dumps", "state_dict"])
+def test_samples_prepared_ahead_are_no_part_of_a_state(
+    make: Make, way: str, prefetch: tuple[int, int], tmp_path: Path
+) -> None:
+    saved, loaded = (make(prefetch=number) for number in prefetch)
+    saved.sample()
+    copy_state(way, saved, loaded, tmp_path)
+    assert loaded.sample()["number"].shape == saved.sample()["number"].shape
+    assert not [file for file in tmp_path.rglob("*") if file.suffix in (".pkl", ".pt", ".t")]
+
+
+def test_a_dump_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="nowhere: not a dump of these data"):
+        single().loads(tmp_path / "nowhere")
+
+
+def test_rows_are_found_from_the_end_too() -> None:
+    buffer = single()
+    index = torch.tensor([-1, 0, -50])
+    assert buffer[index]["number"].tolist() == buffer[:]["number"][index].tolist()
 
 
 @every_buffer

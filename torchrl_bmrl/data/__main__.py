@@ -90,7 +90,7 @@ def check(options: argparse.Namespace) -> int:
     for key, message in summary.problems:
         print(f"error: {options.file}: {key}: {message}", file=sys.stderr)
     if summary.problems:
-        print(f"{len(summary.problems)} errors", file=sys.stderr)
+        print(f"wrong: {len(summary.problems)}", file=sys.stderr)
     return 1 if summary.problems else 0
 
 
@@ -104,6 +104,7 @@ def convert_command(options: argparse.Namespace) -> int:
             task=options.task,
             tracking=options.tracking,
             split=options.split,
+            fps=options.fps,
             report=bar.update,
         )
     print(f"{options.out}: {options.to}, {bar.n} episodes")
@@ -139,6 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parts.add_argument("out", type=Path, help="new file (robomimic) or folder (minari, lerobot)")
     parts.add_argument("--to", choices=TARGETS, required=True)
     parts.add_argument("--split", help="one mask's episodes of a file in robomimic's layout")
+    parts.add_argument("--fps", type=float, help="steps per second, where the source tells none")
     parts.set_defaults(run=convert_command)
     options = parser.parse_args(arguments)
     try:

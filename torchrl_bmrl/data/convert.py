@@ -16,8 +16,6 @@ from torchrl_bmrl.data.schema import Bounds, check_episode, layout_of
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
 
 TARGETS = ("robomimic", "minari", "lerobot")
-CONTROL_FREQUENCY = 20.0
-"""Steps per second [Hz] of sources that do not tell theirs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,13 +41,13 @@ class Source:
     oddities: Sequence[str] = ()
 
     @property
-    def fps(self) -> float:
-        """Steps per second [Hz]."""
+    def fps(self) -> float | None:
+        """Steps per second [Hz], where the data set tells them."""
         kwargs = self.metadata.get("env_args", {}).get("env_kwargs") or {}
         for known in (self.metadata.get("fps"), kwargs.get("control_freq")):
             if isinstance(known, int | float) and 0 < known < float("inf"):
                 return float(known)
-        return CONTROL_FREQUENCY
+        return None
 
 
 def find_format(path: Path) -> str:
@@ -134,6 +132,7 @@ def convert(
     task: str | None = None,
     tracking: float = 1.0,
     split: str | None = None,
+    fps: float | None = None,
     report: Callable[[int], object] = lambda _: None,
 ) -> None:
     """Writes a data set in another format, whole, or not at all; the source is only read.
@@ -145,10 +144,13 @@ def convert(
         task: whose scene a robosuite ``demo.hdf5`` was recorded in.
         tracking: see :func:`torchrl_bmrl.data.robosuite.open_episodes`.
         split: name of a mask of a file in robomimic's layout; ``None`` for all episodes.
+        fps: steps per second [Hz], for Minari and LeRobot; ``None`` for the source's own.
         report: called with 1 after every episode.
 
     Raises:
         UnknownNameError: for a format that cannot be written.
+        ConfigError: for options that the formats have no use for, and for LeRobot without ``fps``
+            where the source does not tell it.
         DataError: naming file, key and row for what cannot be trained on, for a target that exists
             or cannot be written.
     """
@@ -162,14 +164,16 @@ def convert(
         try:
             if os.path.lexists(target):
                 raise DataError(target, None, "exists; valid: a new name")
-            _write(target, to, data, episodes)
+            _write(target, to, data, episodes, data.fps if fps is None else fps)
         except BMRLError:
             raise
         except (OSError, RuntimeError) as error:  # RuntimeError: how h5py reports a full disk
             raise DataError(target, None, f"cannot be written ({error})") from error
 
 
-def _write(target: Path, to: str, data: Source, episodes: Iterator[Episode]) -> None:
+def _write(
+    target: Path, to: str, data: Source, episodes: Iterator[Episode], fps: float | None
+) -> None:
     env_args = data.metadata.get("env_args", {})
     name = data.metadata.get("task") or env_args.get("env_name") or target.name
     if to == "robomimic":
@@ -188,9 +192,11 @@ def _write(target: Path, to: str, data: Source, episodes: Iterator[Episode]) -> 
             target, episodes, env_args=env_args, attributes=attributes, masks=masks
         )
     elif to == "minari":
-        minari.write_episodes(target, episodes, fps=data.fps, description=str(name))
+        minari.write_episodes(target, episodes, fps=fps, description=str(name))
+    elif fps is None:
+        raise ConfigError("the source does not tell its steps per second; valid: --fps")
     else:
-        lerobot.write_episodes(target, episodes, fps=data.fps, task=str(name))
+        lerobot.write_episodes(target, episodes, fps=fps, task=str(name))
 
 
 def _checked(path: Path, data: Source, report: Callable[[int], object]) -> Iterator[Episode]:

@@ -128,8 +128,9 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
         }
         self._path = self.root / f"{source.stem}-{_digest(source, options, split_trajs)}"
         if not self._is_downloaded():
-            # What is there and not whole was damaged after it was written.
-            shutil.rmtree(self._path, ignore_errors=True)
+            if self._path.exists() and not self._is_downloaded():
+                # Damaged. (Asked twice: another process may just have finished.)
+                shutil.rmtree(self._path, ignore_errors=True)
             _convert(source, self._path, options, split_trajs)
         data = TensorDict.load_memmap(self._path / "data")
         super().__init__(
