@@ -34,6 +34,7 @@ _NEEDS = {
                 "robosuite",
             )
         ),
+        "tests/episode_files.py",
         "torchrl_bmrl/experts/*",
     ],
     "matplotlib": ["torchrl_bmrl/reports/*"],

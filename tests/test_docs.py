@@ -16,6 +16,8 @@ BLOCKS = {page: re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL) 
 @pytest.mark.filterwarnings(NO_UPDATER)
 @pytest.mark.parametrize("page", [p for p in PAGES if BLOCKS[p]], ids=lambda p: p.stem)
 def test_examples_of_a_page_run_one_after_the_other(page: Path) -> None:
+    for package in re.findall(r"<!-- needs: (\w+) -->", page.read_text()):
+        pytest.importorskip(package)
     namespace = {"__name__": "example"}
     for block in BLOCKS[page]:
         exec(compile(block, page.name, "exec"), namespace)
