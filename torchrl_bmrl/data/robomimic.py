@@ -147,13 +147,13 @@ def find_oddities(path: str | Path) -> list[str]:
                 f"{len(cut)} episodes have no next_obs, such as {cut[0]}: where they do not "
                 "terminate, their last step is left out"
             )
-        masks = {
-            mask: set(read_strings(path, file, f"mask/{mask}"))
-            for mask in MASKS
-            if mask in _read_masks(path, file)
-        }
-        if both := sorted(set.intersection(*masks.values())) if len(masks) == len(MASKS) else []:
-            oddities.append(f"{len(both)} episodes are in train and in valid, such as {both[0]}")
+        present = _read_masks(path, file)
+        if set(MASKS) <= set(present):
+            train, valid = (set(read_strings(path, file, f"mask/{mask}")) for mask in MASKS)
+            if both := sorted(train & valid):
+                oddities.append(
+                    f"{len(both)} episodes are in train and in valid, such as {both[0]}"
+                )
     return oddities
 
 
