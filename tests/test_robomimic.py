@@ -631,3 +631,13 @@ def test_env_args_that_are_not_json_are_named(path: Path, value: Any) -> None:
         file["data"].attrs["env_args"] = value
     with pytest.raises(DataError, match=r"lift\.hdf5: data: attribute env_args is not"):
         read_metadata(path)
+
+
+@pytest.mark.parametrize("key", ["actions", "rewards", "successes", "obs/object", "obs/image"])
+def test_a_flipped_bit_in_an_array_is_found_when_it_is_read(path: Path, key: str) -> None:
+    with h5py.File(path) as file:
+        chunk = file[f"{DEMO}/{key}"].id.get_chunk_info(0)
+    content = bytearray(path.read_bytes())
+    content[chunk.byte_offset + chunk.size // 2] ^= 1
+    path.write_bytes(content)
+    assert refusal(path).key == f"{DEMO}/{key}"
