@@ -33,6 +33,7 @@ def collect(config: Config) -> None:
         gains=config.collect.gains,
         seed=config.seed,
         workers=config.workers,
+        stepper=config.stepper,
     )
     write_statistics(data_dir, config.tasks)
 

@@ -31,7 +31,7 @@ from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome, evaluate_policy
 from torchrl_bmrl.experts.collect import collect_episode
 from torchrl_bmrl.modules import BCQPolicy
-from torchrl_bmrl.names import TASKS
+from torchrl_bmrl.names import HORIZON, TASKS
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
 from torchrl_bmrl.reports import Embeddings, write_report
 from torchrl_bmrl.runs import read_versions
@@ -41,19 +41,21 @@ def evaluate_job(job: tuple[Config, str, str, str], report: Report) -> list[Resu
     """All episodes of one task, policy and source of m; kept at once, read back if there."""
     config, task, policy_name, source = job
     run_dir, episodes = Path(config.run_dir), config.evaluate.episodes
+    options = {"num_envs": episodes, "stepper": config.stepper}
     path = run_dir / "evaluation" / ("-".join(filter(None, (task, policy_name, source))) + ".csv")
     if path.exists():
-        report(episodes)
+        report(episodes * HORIZON)
         return read_results(path)
     seeds = [derive_seed(config.seed, "evaluate", task, i) for i in range(episodes)]
     statistics = read_statistics(run_dir / "data")
     if policy_name == "expert":
         outcomes = expert_outcomes(config, task, seeds)
+        report(episodes * HORIZON)
     elif policy_name == "bcq":
         loss, _ = load_bcq_loss(run_dir / "bcq" / task / "checkpoint.safetensors")
         policy = BCQPolicy.from_loss(loss, num_candidates=config.evaluate.num_candidates)
-        with closing(make_env(task, statistics)) as env:
-            outcomes = evaluate_policy(env, policy, seeds)
+        with closing(make_env(task, statistics, **options)) as env:
+            outcomes = evaluate_policy(env, policy, seeds, report=report)
     else:
         student, metadata = load_student(run_dir / "distill" / "checkpoint.safetensors")
         policy = student.policy(
@@ -65,9 +67,8 @@ def evaluate_job(job: tuple[Config, str, str, str], report: Report) -> list[Resu
         )
         demonstration = held_out[held_out["episode"] == 0]
         transform = student.task_latent_source(source, index, demonstration)
-        with closing(make_env(task, statistics, transform)) as env:
-            outcomes = evaluate_policy(env, policy, seeds)
-    report(episodes)
+        with closing(make_env(task, statistics, transform, **options)) as env:
+            outcomes = evaluate_policy(env, policy, seeds, report=report)
     rows = [
         ResultRow(
             task=task,
@@ -90,7 +91,13 @@ def expert_outcomes(config: Config, task: str, seeds: list[int]) -> list[Episode
         return [
             EpisodeOutcome(float(episode.rewards.sum()), bool(episode.extras["successes"].any()))
             for episode in (
-                collect_episode(task, seed, noise=config.collect.noise, gains=config.collect.gains)
+                collect_episode(
+                    task,
+                    seed,
+                    noise=config.collect.noise,
+                    gains=config.collect.gains,
+                    stepper=config.stepper,
+                )
                 for seed in seeds
             )
         ]
@@ -137,9 +144,9 @@ def evaluate(config: Config) -> None:
         evaluate_job,
         jobs,
         workers=config.workers,
-        total=len(jobs) * config.evaluate.episodes,
+        total=len(jobs) * config.evaluate.episodes * HORIZON,
         description="evaluating",
-        unit="episode",
+        unit="step",
     )
     write_results(run_dir / "results.csv", [row for part in rows for row in part])
     embeddings, accuracy = embed_held_out(config)

@@ -57,7 +57,7 @@ from torchrl.objectives import BCLoss, DDPGLoss, IQLLoss, LossModule, SoftUpdate
 
 from torchrl_bmrl.checkpoint import load_checkpoint, save_checkpoint
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
-from torchrl_bmrl.evaluation.rollout import rollout_episode
+from torchrl_bmrl.evaluation.rollout import rollout_episodes
 from torchrl_bmrl.files import write_atomic, write_rows
 from torchrl_bmrl.modules import (
     ActionVAE,
@@ -68,7 +68,7 @@ from torchrl_bmrl.modules import (
 )
 from torchrl_bmrl.modules.generator import make_mlp
 from torchrl_bmrl.objectives import BCQLoss, PLASLoss
-from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
+from torchrl_bmrl.parallel import Report, available_cores, derive_seed, run_jobs
 from torchrl_bmrl.runs import check_finite, open_run
 
 
@@ -77,7 +77,7 @@ class Settings:
     """Everything that decides a run."""
 
     run_dir: str = "runs/extrapolation-${env}"
-    workers: int = 2  # processes; does not change any result
+    workers: int = field(default_factory=available_cores)  # processes; no result depends on them
     env: str = "HalfCheetah-v5"
     seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
     algorithms: list[str] = field(default_factory=lambda: list(ALGORITHMS))
@@ -277,7 +277,7 @@ def train(settings: Settings, name: str, seed: int, report: Report) -> list[floa
     for i in range(settings.eval_episodes):
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             start = derive_seed(seed, "evaluate", i)
-            episode = rollout_episode(env, policy, seed=start, max_steps=1000)
+            episode = rollout_episodes(env, policy, seed=start, max_steps=1000)
         returns.append(episode["next", "reward"].sum().item())
     env.close()
     return returns

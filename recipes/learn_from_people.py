@@ -36,6 +36,7 @@ from torchrl_bmrl.evaluation import bootstrap_interval
 from torchrl_bmrl.evaluation.rollout import evaluate_policy
 from torchrl_bmrl.files import write_atomic, write_rows
 from torchrl_bmrl.modules import BCQPolicy
+from torchrl_bmrl.names import HORIZON
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
 
 TASK = "lift"
@@ -72,8 +73,10 @@ def evaluate_job(job: Job, report: Report) -> list[dict]:
         starts = [derive_seed(config.seed, "evaluate", TASK, i) for i in range(count)]
         loss, _ = load_bcq_loss(folder / "checkpoint.safetensors")
         policy = BCQPolicy.from_loss(loss, num_candidates=config.evaluate.num_candidates)
-        with closing(make_env(TASK, read_statistics(Path(config.run_dir) / "data"))) as env:
-            outcomes = evaluate_policy(env, policy, starts)
+        statistics = read_statistics(Path(config.run_dir) / "data")
+        env = make_env(TASK, statistics, num_envs=count, stepper=config.stepper)
+        with closing(env):
+            outcomes = evaluate_policy(env, policy, starts, report=report)
         rows = [
             {
                 "share": share,
@@ -85,7 +88,8 @@ def evaluate_job(job: Job, report: Report) -> list[dict]:
             for i, outcome in enumerate(outcomes)
         ]
         write_rows(path, rows)
-    report(config.evaluate.episodes)
+    else:
+        report(config.evaluate.episodes * HORIZON)
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
 
@@ -147,9 +151,9 @@ def learn_from_people(config: Config) -> None:
         evaluate_job,
         agents,
         workers=config.workers,
-        total=config.evaluate.episodes * len(agents),
+        total=config.evaluate.episodes * HORIZON * len(agents),
         description="evaluating",
-        unit="episode",
+        unit="step",
     )
     rows = [row for part in results for row in part]
     write_rows(Path(config.run_dir) / "human.csv", rows)

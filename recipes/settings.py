@@ -13,11 +13,12 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from torchrl_bmrl.agents import LATENT_SOURCES
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.experts.controllers import ExpertGains
-from torchrl_bmrl.names import TASKS, check_task
+from torchrl_bmrl.names import STEPPERS, TASKS, check_task
 from torchrl_bmrl.objectives.checks import check_value_bounds
 from torchrl_bmrl.objectives.common import LOSS_FUNCTIONS
 from torchrl_bmrl.objectives.distillation import CONTEXTS, ENCODER_TERMS
 from torchrl_bmrl.objectives.generative import KL_REDUCTIONS
+from torchrl_bmrl.parallel import available_cores
 from torchrl_bmrl.runs import LOGGERS, open_run
 
 
@@ -109,7 +110,8 @@ class Config:
     seed: int = 0
     run_dir: str = "runs/${hydra:job.name}-${hydra:runtime.choices.preset}-seed${seed}"
     tasks: list[str] = field(default_factory=lambda: list(TASKS))
-    workers: int = 2  # processes; does not change any result
+    workers: int = field(default_factory=available_cores)  # processes; no result depends on them
+    stepper: str = "fast"  # or robosuite, four times slower; no result depends on it
     logger: str = "csv"  # csv, wandb, tensorboard, none
     log_interval: int = 100  # updates
     checkpoint_interval: int = 1000  # updates
@@ -143,6 +145,7 @@ POSITIVE = (
 )
 CHOICES = {
     "logger": LOGGERS,
+    "stepper": STEPPERS,
     "bcq.loss_function": LOSS_FUNCTIONS,
     "bcq.kl_reduction": KL_REDUCTIONS,
     "distill.context": CONTEXTS,

@@ -141,7 +141,8 @@ def evaluate_epoch(config, task, loss, statistics, epoch, update) -> list[dict]:
     count = config.bcq.eval_episodes
     seeds = [derive_seed(config.seed, "curve", task, i) for i in range(count)]
     policy = BCQPolicy.from_loss(loss, num_candidates=config.evaluate.num_candidates)
-    with closing(make_env(task, statistics)) as env:
+    env = make_env(task, statistics, num_envs=count, stepper=config.stepper)
+    with closing(env):
         outcomes = evaluate_policy(env, policy, seeds)
     return [
         {

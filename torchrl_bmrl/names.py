@@ -18,6 +18,9 @@ TASKS: tuple[str, ...] = ("reach", "lift", *(f"push_{name}" for name in PUSH_DIR
 HORIZON = 200
 """Steps of an episode; it ends there by truncation, never by termination."""
 
+STEPPERS = ("fast", "robosuite")
+"""Who advances the simulator; the trajectories are the same to the bit."""
+
 
 def check_task(task: str) -> str:
     """Returns ``task`` if it is one of :data:`TASKS`.

@@ -5,11 +5,15 @@ from __future__ import annotations
 import hashlib
 import multiprocessing
 import os
-import queue
+import signal
+import sys
 import threading
-from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+import traceback
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection, wait
+from multiprocessing.pool import RemoteTraceback
 from typing import Any, TypeVar
 
 import torch
@@ -22,26 +26,20 @@ Result = TypeVar("Result")
 Report = Callable[[int], None]
 """Called by a job with the number of units that it has finished since its last call."""
 
-_progress: Any = None  # the worker's queue to the bar
+TRIES = 3
+"""So often is a job begun whose worker dies."""
 
 
-def _start_worker(progress: Any) -> None:
-    global _progress
-    _progress = progress
-    torch.set_num_threads(1)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+def available_cores() -> int:
+    """Cores that this process may use.
 
-
-def _end_with_parent() -> None:
-    # A worker that outlives a killed run would write into the folder of the run that goes on.
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
-def _run(function: Callable[[Job, Report], Result], job: Job) -> Result:
-    return function(job, _progress.put)
+    Example:
+        >>> available_cores() >= 1
+        True
+    """
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def run_jobs(
@@ -58,6 +56,9 @@ def run_jobs(
     With more than one worker the jobs run in freshly spawned processes, so ``function`` and the
     jobs must be importable by name. Every job runs on one thread, whatever the number of workers.
 
+    A worker that dies (killed for memory, say) is reported and replaced, and its job done again: a
+    job must be one that can be, from the start or from what it kept.
+
     Args:
         function: what to do with a job; it calls ``report(n)`` as it advances.
         jobs: its arguments.
@@ -67,7 +68,7 @@ def run_jobs(
         unit: what it counts.
 
     Raises:
-        BMRLError: if a worker is killed.
+        BMRLError: if a job's workers die three times.
 
     Example:
         >>> run_jobs(
@@ -86,47 +87,123 @@ def run_jobs(
                 return [function(job, bar.update) for job in jobs]
             finally:
                 torch.set_num_threads(threads)
-        try:
+        with _one_thread_each():
             return _run_in_processes(function, jobs, min(workers, len(jobs)), bar)
-        except BrokenProcessPool as error:
-            raise BMRLError(
-                f"{description}: a worker process was killed (out of memory?); what was finished "
-                "is kept, the same command goes on"
-            ) from error
 
 
-def _run_in_processes(
-    function: Callable[[Job, Report], Result], jobs: list[Job], workers: int, bar: tqdm
-) -> list[Result]:
-    context = multiprocessing.get_context("spawn")
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"  # read by the children's numpy at import
-    progress: Any = context.Queue()
-    executor = ProcessPoolExecutor(workers, context, _start_worker, (progress,))
     try:
-        futures = [executor.submit(_run, function, job) for job in jobs]
-        pending = set(futures)
-        while pending:
-            done, pending = wait(pending, timeout=0.2, return_when=FIRST_COMPLETED)
-            _drain(progress, bar)
-            for future in done:
-                future.result()
-        return [future.result() for future in futures]
+        yield
     finally:
-        executor.shutdown(wait=True, cancel_futures=True)
-        _drain(progress, bar)
         if before is None:
             del os.environ["OMP_NUM_THREADS"]
         else:
             os.environ["OMP_NUM_THREADS"] = before
 
 
-def _drain(progress: Any, bar: tqdm) -> None:
+class _Worker:
+    """A process, and the job that it is at."""
+
+    def __init__(self, function: Callable[[Job, Report], Result]) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.connection, theirs = context.Pipe()
+        self.process = context.Process(target=_serve, args=(theirs, function), daemon=True)
+        self.process.start()
+        theirs.close()  # so that the process's end closes the pipe
+        self.job: int | None = None
+        self.units = 0  # that the job has reported
+
+    def begin(self, number: int, job: Any) -> None:
+        self.job, self.units = number, 0
+        with suppress(OSError):  # if it is dead already, its connection says so next
+            self.connection.send(job)
+
+
+def _serve(connection: Connection, function: Callable[[Job, Report], Result]) -> None:
+    """A worker's life: jobs in, reports and results out."""
+    torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     while True:
         try:
-            bar.update(progress.get_nowait())
-        except queue.Empty:
+            job = connection.recv()
+        except EOFError:
             return
+        try:
+            connection.send(("result", function(job, lambda n: connection.send(("report", n)))))
+        except Exception as error:
+            connection.send(("error", (error, traceback.format_exc())))
+
+
+def _end_with_parent() -> None:
+    # A worker that outlives a killed run would write into the folder of the run that goes on.
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _run_in_processes(
+    function: Callable[[Job, Report], Result], jobs: list[Job], workers: int, bar: tqdm
+) -> list[Result]:
+    waiting, deaths = deque(range(len(jobs))), Counter[int]()
+    results: dict[int, Result] = {}
+    pool: list[_Worker] = []
+    try:
+        while len(results) < len(jobs):
+            while waiting and len(pool) < workers:
+                pool.append(_Worker(function))
+                pool[-1].begin(number := waiting.popleft(), jobs[number])
+            by_connection: dict[Any, _Worker] = {worker.connection: worker for worker in pool}
+            for connection in wait(list(by_connection)):
+                worker = by_connection[connection]
+                number = worker.job
+                assert number is not None
+                try:
+                    kind, value = worker.connection.recv()
+                except (EOFError, OSError):
+                    pool.remove(worker)
+                    deaths[number] += 1
+                    _report_death(worker, bar, number, len(jobs), deaths[number])
+                    waiting.appendleft(number)
+                    continue
+                if kind == "report":
+                    worker.units += value
+                    bar.update(value)
+                elif kind == "error":
+                    error, text = value
+                    raise error from RemoteTraceback(text)
+                else:
+                    results[number] = value
+                    if waiting:
+                        worker.begin(number := waiting.popleft(), jobs[number])
+                    else:
+                        pool.remove(worker)
+                        worker.connection.close()
+                        worker.process.join()
+        return [results[number] for number in range(len(jobs))]
+    finally:
+        for worker in pool:
+            worker.process.terminate()
+            worker.process.join()
+
+
+def _report_death(worker: _Worker, bar: tqdm, number: int, jobs: int, deaths: int) -> None:
+    worker.process.join()
+    bar.update(-worker.units)
+    code = worker.process.exitcode or 0
+    how = (
+        f"was killed by signal {-code} (out of memory?)" if code < 0 else f"ended with code {code}"
+    )
+    what = f"{bar.desc}: the worker of job {number + 1} of {jobs} {how}"
+    if deaths == TRIES:
+        raise BMRLError(
+            f"{what}, the {TRIES}rd time; what was finished is kept, the same command goes on"
+        )
+    tqdm.write(f"{what}; the job is done again", file=sys.stderr)
 
 
 def derive_seed(seed: int, *names: str | int) -> int:

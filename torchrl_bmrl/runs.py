@@ -17,7 +17,7 @@ from torchrl_bmrl import __version__
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
 from torchrl_bmrl.files import write_atomic
 
-FREE_TO_CHANGE = ("run_dir", "workers", "logger")
+FREE_TO_CHANGE = ("run_dir", "workers", "stepper", "logger")
 """Settings that do not change a run's result, and so may differ when it goes on."""
 LOGGERS = ("csv", "wandb", "tensorboard", "none")
 PACKAGES = ("torch", "torchrl", "tensordict", "robosuite", "mujoco", "gymnasium", "numpy", "h5py")

@@ -254,12 +254,12 @@ def _transfer(recording: Recording, env: _BMRLSawyerTask, there: _Scene, rows: n
     if env.has_cube:
         position = here.columns["cube"][:3]
         states[:, position] += shift
-        env.cube_start = states[0, position].copy()
+        env.goal_start = states[0, position].copy()
         _set_cube_size(here, there.model.geom_size[there.cube[0]])
     else:
         sites = [there.model.site(i).name for i in range(there.model.nsite)]
         goal = there.data.site_xpos[_only(recording, "site", "goal_marker", sites)] + shift
-        env._goal = env.sim.model.site_pos[env._goal_site_id] = goal
+        env.goal_start = goal
     return states, here
 
 

@@ -14,7 +14,8 @@ def register() -> None:
             gymnasium.register(
                 gymnasium_id(task),
                 entry_point="torchrl_bmrl.envs.tasks:SawyerEnv",
-                max_episode_steps=HORIZON,
-                kwargs={"task": task},
+                vector_entry_point="torchrl_bmrl.envs.vector:SawyerVectorEnv",
+                # Not gymnasium's TimeLimit: its count is not part of a state that one returns to.
+                kwargs={"task": task, "horizon": HORIZON},
                 disable_env_checker=True,
             )

@@ -10,27 +10,34 @@ Reference: *Compositional Skill Learning Using Batch Meta RL*, section 3.
 from __future__ import annotations
 
 import logging
+import warnings
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import gymnasium
 import mujoco
 import numpy as np
 
+from torchrl_bmrl.envs.caching import user_numba_cache
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.names import PUSH_DIRECTIONS, TASKS, check_task
+from torchrl_bmrl.names import PUSH_DIRECTIONS, STEPPERS, TASKS, check_task
 
 # robosuite logs "no private macro file" and controller notes at import and at every construction.
 # A level set before its import is undone by it; a filter stays.
 logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= logging.ERROR)
 
-import robosuite  # noqa: E402
-from robosuite.controllers import load_composite_controller_config  # noqa: E402
-from robosuite.environments.manipulation.manipulation_env import ManipulationEnv  # noqa: E402
-from robosuite.models.arenas import TableArena  # noqa: E402
-from robosuite.models.objects import BoxObject  # noqa: E402
-from robosuite.models.tasks import ManipulationTask  # noqa: E402
-from robosuite.utils.mjcf_utils import new_site  # noqa: E402
-from robosuite.utils.observables import Observable, sensor  # noqa: E402
+with user_numba_cache():
+    import robosuite
+    from robosuite.controllers import load_composite_controller_config
+    from robosuite.environments.manipulation.manipulation_env import ManipulationEnv
+    from robosuite.models.arenas import TableArena
+    from robosuite.models.objects import BoxObject
+    from robosuite.models.tasks import ManipulationTask
+    from robosuite.utils.mjcf_utils import new_site
+    from robosuite.utils.observables import Observable, sensor
+
+    from torchrl_bmrl.envs.stepper import FastStepper, why_not_fast
 
 CONTROL_FREQUENCY = 20
 """Actions per second [Hz]."""
@@ -82,16 +89,56 @@ def push_velocity_reward(velocity: np.ndarray, direction: np.ndarray) -> float:
     return float(1.0 - np.tanh(np.linalg.norm(velocity - direction)))
 
 
+def without_pictures(xml: str) -> str:
+    """The same physics without what only a camera sees: geoms that touch nothing, their meshes.
+
+    Trajectories stay the same to the bit; a model takes 0.1 MB and not 80, a step three quarters of
+    the time.
+
+    Args:
+        xml: MJCF whose bodies have explicit inertias, as robosuite's robots do.
+    """
+    root = ET.fromstring(xml)
+    for parent in list(root.iter()):
+        for geom in parent.findall("geom"):
+            if geom.get("contype") == geom.get("conaffinity") == "0":
+                parent.remove(geom)
+            else:
+                geom.attrib.pop("material", None)
+    asset = root.find("asset")
+    assert asset is not None
+    shown = {geom.get("mesh") for geom in root.iter("geom")}
+    for element in list(asset):
+        if element.tag != "mesh" or element.get("name") not in shown:
+            asset.remove(element)
+    size = root.find("size")
+    assert size is not None
+    # robosuite asks for room for 5000 contacts; an episode uses 60 kB of this.
+    size.attrib = {"memory": "32M"}
+    return ET.tostring(root, encoding="unicode")
+
+
+class _LeanTask(ManipulationTask):
+    def generate_id_mappings(self, sim: Any) -> None:
+        """Nothing: robosuite looks up the geoms here that its segmenting cameras show."""
+
+
 class _BMRLSawyerTask(ManipulationEnv):
     """What the tasks share: Sawyer, table, goal marker, a start set by inverse kinematics.
 
     Subclasses place the end-effector, name the goal, and compute reward terms and success. The
-    horizon is not theirs: gymnasium's ``TimeLimit`` truncates.
+    horizon is not theirs: :class:`SawyerEnv` truncates.
+
+    Args:
+        seed: of the starts.
+        lean: simulate :func:`without_pictures`; for cameras leave it off.
+        **kwargs: robosuite's own options.
     """
 
     has_cube: ClassVar[bool] = True
 
-    def __init__(self, *, seed: int | None = None, **kwargs: Any) -> None:
+    def __init__(self, *, seed: int | None = None, lean: bool = False, **kwargs: Any) -> None:
+        self.lean = lean
         settings: dict[str, Any] = {
             "robots": "Sawyer",
             "controller_configs": load_composite_controller_config(robot="Sawyer"),
@@ -124,10 +171,28 @@ class _BMRLSawyerTask(ManipulationEnv):
             half = [CUBE_HALF_SIZE] * 3
             self.cube = BoxObject("cube", size_min=half, size_max=half, rgba=[0.8, 0.2, 0.1, 1])
             objects.append(self.cube)
-        self.model = ManipulationTask(arena, [model], objects)
+        self.model = (_LeanTask if self.lean else ManipulationTask)(arena, [model], objects)
+        if self.lean:
+            model.mujoco_model = None  # a second robot, 60 MB, for robosuite's whole-body IK
         self.model.worldbody.append(
             new_site("goal_marker", pos=(0, 0, 1), size=(0.015,), rgba=(1, 0.1, 0.1, 0.7), group=1)
         )
+
+    def edit_model_xml(self, xml_str: str) -> str:
+        """Besides what robosuite does to it, the leaner model where asked for."""
+        self._scene = super().edit_model_xml(xml_str)
+        return without_pictures(self._scene) if self.lean else self._scene
+
+    def scene_xml(self) -> str:
+        """MJCF of the whole scene, pictures included, the goal marker where it stands.
+
+        It is this environment's own. MuJoCo's ``mj_saveLastXML`` would save the one loaded last.
+        """
+        root = ET.fromstring(self._scene)
+        (marker,) = (site for site in root.iter("site") if site.get("name") == "goal_marker")
+        position = self.sim.model.site_pos[self._goal_site_id]
+        marker.set("pos", " ".join(repr(float(x)) for x in position))
+        return ET.tostring(root, encoding="unicode")
 
     def _setup_references(self) -> None:
         super()._setup_references()
@@ -136,6 +201,10 @@ class _BMRLSawyerTask(ManipulationEnv):
         self._eef_body_id = self.sim.model.body_name2id(self.robots[0].gripper["right"].root_body)
         if self.has_cube:
             self._cube_body_id = self.sim.model.body_name2id(self.cube.root_body)
+            self._cube_dof = self.sim.model.get_joint_qvel_addr(self.cube.joints[0])[0]
+            pads = self.robots[0].gripper["right"].important_geoms
+            names = [*pads["left_fingerpad"], *pads["right_fingerpad"], *self.cube.contact_geoms]
+            self._grasp_geoms = [self.sim.model.geom_name2id(name) for name in names]
 
     def _setup_observables(self) -> dict[str, Observable]:
         """Adds ``goal_pos`` to robosuite's own observables; none at all without object_obs."""
@@ -164,19 +233,19 @@ class _BMRLSawyerTask(ManipulationEnv):
         joints = self._inverse_kinematics(self._sample_start())
         robot = self.robots[0]
         robot.set_robot_joint_positions(joints)
+        self.sim.data.qpos[robot._ref_gripper_joint_pos_indexes["right"]] = GRIPPER_OPEN
         # Without these two the controller holds the pose before the move for one control step, and
-        # the gripper half closes: both are state that no reset of the simulator touches.
+        # the gripper half closes: both are state that no reset of the simulator touches. The
+        # fingers come first: the controller keeps the mass matrix for the first physics step.
         robot.composite_controller.part_controllers["right"].update_initial_joints(joints)
         robot.gripper["right"].current_action = np.array([-1.0, 1.0])
-        self.sim.data.qpos[robot._ref_gripper_joint_pos_indexes["right"]] = GRIPPER_OPEN
         self.sim.forward()
-        self.sim.model.site_pos[self._goal_site_id] = self.goal
 
     def _place_cube(self) -> np.ndarray:
         xy = self.rng.uniform(-CUBE_RANGE, CUBE_RANGE, size=2)
         position = TABLE_TOP + np.array([xy[0], xy[1], CUBE_HALF_SIZE])
         self.sim.data.set_joint_qpos(self.cube.joints[0], np.append(position, [1.0, 0, 0, 0]))
-        self.cube_start = position
+        self.goal_start = position
         return position
 
     def _inverse_kinematics(
@@ -214,6 +283,18 @@ class _BMRLSawyerTask(ManipulationEnv):
     # -- state ---------------------------------------------------------------------------------
 
     @property
+    def goal_start(self) -> np.ndarray:
+        """Where the goal was when the episode began, (3,) [m]: the goal marker's place.
+
+        The point to reach, or the cube's centre before anything moved it.
+        """
+        return np.array(self.sim.model.site_pos[self._goal_site_id])
+
+    @goal_start.setter
+    def goal_start(self, position: np.ndarray) -> None:
+        self.sim.model.site_pos[self._goal_site_id] = position
+
+    @property
     def eef_position(self) -> np.ndarray:
         """End-effector position (3,) [m]."""
         return np.array(self.sim.data.site_xpos[self._eef_site_id])
@@ -231,12 +312,15 @@ class _BMRLSawyerTask(ManipulationEnv):
     @property
     def cube_displacement(self) -> np.ndarray:
         """Cube's position relative to its start (3,) [m]."""
-        return np.array(self.sim.data.body_xpos[self._cube_body_id]) - self.cube_start
+        return np.array(self.sim.data.body_xpos[self._cube_body_id]) - self.goal_start
 
     @property
     def grasped(self) -> bool:
         """Whether both fingers touch the cube."""
-        return bool(self._check_grasp(gripper=self.robots[0].gripper, object_geoms=self.cube))
+        left, right, cube = self._grasp_geoms
+        touching = self.sim.data._data.contact.geom
+        others = touching[(touching == cube).any(1)]
+        return bool((others == left).any() and (others == right).any())
 
     def named_observation(self) -> dict[str, np.ndarray]:
         """The observation's parts under robosuite's names (float64; quaternion xyzw)."""
@@ -276,7 +360,7 @@ class BMRLSawyerReach(_BMRLSawyerTask):
     has_cube = False
 
     def _sample_start(self) -> np.ndarray:
-        self._goal = self.rng.uniform(REACH_GOAL_LOW, REACH_GOAL_HIGH)
+        self.goal_start = self.rng.uniform(REACH_GOAL_LOW, REACH_GOAL_HIGH)
         direction = self.rng.standard_normal(3)
         radius = REACH_START_RADIUS * self.rng.uniform() ** (1 / 3)
         return REACH_START + radius * direction / np.linalg.norm(direction)
@@ -284,7 +368,7 @@ class BMRLSawyerReach(_BMRLSawyerTask):
     @property
     def goal(self) -> np.ndarray:
         """The point to reach (3,) [m]."""
-        return self._goal.copy()
+        return self.goal_start
 
     def _check_success(self) -> bool:
         return bool(np.linalg.norm(self.eef_position - self.goal) < REACH_SUCCESS_DISTANCE)
@@ -325,7 +409,7 @@ class BMRLSawyerPush(_BMRLSawyerTask):
 
     def reward_terms(self) -> dict[str, float]:
         """Distance to the cube, the cube's velocity, its distance from the start."""
-        velocity = self.sim.data.get_joint_qvel(self.cube.joints[0])[:3]
+        velocity = self.sim.data.qvel[self._cube_dof : self._cube_dof + 3]
         moved = float(np.linalg.norm(self.cube_displacement))
         return super().reward_terms() | {
             "velocity": push_velocity_reward(velocity, self.direction),
@@ -372,6 +456,10 @@ def robosuite_metadata(task: str) -> dict[str, Any]:
     }
 
 
+_PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION
+_said: set[str] = set()
+
+
 class SawyerEnv(gymnasium.Env):
     """One Sawyer task as a gymnasium environment.
 
@@ -391,6 +479,16 @@ class SawyerEnv(gymnasium.Env):
         render_mode: ``None`` or ``"rgb_array"``.
         camera: robosuite camera for :meth:`render`.
         image_size: height and width of the rendered picture [pixels].
+        stepper: ``"fast"``, compiled code that gives robosuite's trajectories bit by bit, or
+            ``"robosuite"``. A controller that the first does not cover is left to robosuite, which
+            a warning says once.
+        controller_configs: robosuite's composite controller; by default Sawyer's operational-space
+            control of the pose.
+        horizon: an episode is truncated after so many steps; ``None`` never. (Not gymnasium's
+            ``max_episode_steps``, whose count starts anew when a state is restored.)
+
+    Raises:
+        UnknownNameError: for another task, render mode or stepper.
 
     Example:
         >>> env = SawyerEnv("lift")
@@ -411,16 +509,32 @@ class SawyerEnv(gymnasium.Env):
         render_mode: str | None = None,
         camera: str = "frontview",
         image_size: tuple[int, int] = (256, 256),
+        *,
+        stepper: str = "fast",
+        controller_configs: dict[str, Any] | None = None,
+        horizon: int | None = None,
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise UnknownNameError("render_mode", render_mode, ("rgb_array",))
+        if stepper not in STEPPERS:
+            raise UnknownNameError("stepper", stepper, STEPPERS)
         self.task = task
         self.render_mode = render_mode
         self.camera = camera
         self.image_size = image_size
-        self._renderer: mujoco.Renderer | None = None
-        self.robosuite_env = make_robosuite_env(task, use_object_obs=False)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (7,), dtype=np.float32)
+        self.stepper = stepper
+        self.horizon = horizon
+        self._steps = 0
+        self._fast: FastStepper | None = None
+        self._picture: tuple[mujoco.MjModel, mujoco.MjData, mujoco.Renderer] | None = None
+        options = {} if controller_configs is None else {"controller_configs": controller_configs}
+        self.robosuite_env = make_robosuite_env(
+            task, use_object_obs=False, lean=stepper == "fast", **options
+        )
+        low, high = self.robosuite_env.action_spec
+        self.action_space = gymnasium.spaces.Box(
+            low.astype(np.float32), high.astype(np.float32), dtype=np.float32
+        )
         self.observation_space = gymnasium.spaces.Dict(
             {
                 name: gymnasium.spaces.Box(-np.inf, np.inf, part.shape, dtype=np.float64)
@@ -438,13 +552,25 @@ class SawyerEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Starts an episode; the same ``seed`` gives the same episode."""
+        """Starts an episode; the same ``seed`` gives the same episode.
+
+        Args:
+            seed: of the start and of later unseeded ones.
+            options: ``{"state": state}`` goes on from a state of :meth:`get_state` instead.
+
+        Raises:
+            BMRLError: as :meth:`set_state`.
+        """
         super().reset(seed=seed)
         if seed is not None:
             # In place: assigning robosuite's rng would not reach the samplers that hold it.
             state = np.random.default_rng(seed).bit_generator.state
             self.robosuite_env.rng.bit_generator.state = state
-        self.robosuite_env.reset()
+        if options and "state" in options:
+            self.set_state(options["state"])
+        else:
+            self._steps = 0
+            self.robosuite_env.reset()
         return self.robosuite_env.named_observation(), self._info({})
 
     def step(
@@ -457,30 +583,145 @@ class SawyerEnv(gymnasium.Env):
         """
         action = np.asarray(action, dtype=np.float64)
         if action.shape != self.action_space.shape or not np.isfinite(action).all():
-            raise BMRLError(f"action is {action}; valid: finite, of shape (7,)")
-        self.robosuite_env.step(action)
+            shape = f"({self.action_space.shape[0]},)"
+            raise BMRLError(f"action is {action}; valid: finite, of shape {shape}")
+        self._advance(action)
+        self._steps += 1
         terms = self.robosuite_env.reward_terms()
         observation = self.robosuite_env.named_observation()
-        return observation, sum(terms.values()), False, False, self._info(terms)
+        truncated = self.horizon is not None and self._steps >= self.horizon
+        return observation, sum(terms.values()), False, truncated, self._info(terms)
+
+    def _advance(self, action: np.ndarray) -> None:
+        env = self.robosuite_env
+        if self.stepper == "fast" and (self._fast is None or not self._fast.serves(env)):
+            self._fast = None
+            if (reason := why_not_fast(env)) is None:
+                self._fast = FastStepper(env)
+            elif reason not in _said:
+                _said.add(reason)
+                warnings.warn(f"steps are robosuite's own, and slow: {reason}", stacklevel=3)
+        if self._fast is None:
+            env.step(action)
+            return
+        self._fast.step(action)
+        env.timestep += 1
+        env.cur_time += env.control_timestep
+
+    # -- state ---------------------------------------------------------------------------------
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Everything that decides how the episode goes on, at any step, as arrays.
+
+        ``physics``: MuJoCo's integration state (positions, velocities, warm start, controls, time);
+        ``gripper`` and ``rest_joints``: what robosuite's gripper and arm controllers remember;
+        ``goal_start``; ``steps`` taken; ``rng``: of the starts to come. ``np.savez`` keeps it.
+
+        Exact for Sawyer's own controller and every other that does not interpolate goals.
+        """
+        env, robot = self.robosuite_env, self.robosuite_env.robots[0]
+        model, data = env.sim.model._model, env.sim.data._data
+        physics = np.empty(mujoco.mj_stateSize(model, _PHYSICS))
+        mujoco.mj_getState(model, data, physics, _PHYSICS)
+        arm = robot.composite_controller.part_controllers["right"]
+        return {
+            "physics": physics,
+            "gripper": np.array(robot.gripper["right"].current_action, dtype=np.float64),
+            "rest_joints": np.array(arm.initial_joint, dtype=np.float64),
+            "goal_start": env.goal_start,
+            "steps": np.array([self._steps, env.timestep]),
+            "rng": _rng_to_array(env.rng),
+        }
+
+    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+        """Goes back to a state of :meth:`get_state`, of this environment or of another one.
+
+        What follows equals never having left, in the task at hand: states of lift and of the four
+        pushes can be exchanged.
+
+        Raises:
+            BMRLError: if an array is missing, too many, of another shape or not finite; nothing has
+                changed then.
+        """
+        now = self.get_state()
+        if state.keys() != now.keys():
+            raise BMRLError(f"a state has {sorted(state)}; valid: {sorted(now)}")
+        arrays = {name: np.asarray(state[name]) for name in now}
+        for name, array in arrays.items():
+            valid = now[name]
+            if array.shape != valid.shape or array.dtype != valid.dtype:
+                raise BMRLError(
+                    f"{name} of the state is {array.dtype} {array.shape}; valid here ({self.task}): "
+                    f"{valid.dtype} {valid.shape}"
+                )
+            if not np.isfinite(array).all():
+                raise BMRLError(f"{name} of the state is {array}; valid: finite")
+        self._load_state(arrays)
+        env = self.robosuite_env
+        mujoco.mj_fwdPosition(env.sim.model._model, env.sim.data._data)
+        env.rng.bit_generator.state = _rng_from_array(arrays["rng"])
+
+    def _load_state(self, state: Mapping[str, np.ndarray]) -> None:
+        """The state, but neither the poses that follow from it nor the random numbers to come."""
+        env, robot = self.robosuite_env, self.robosuite_env.robots[0]
+        mujoco.mj_setState(env.sim.model._model, env.sim.data._data, state["physics"], _PHYSICS)
+        robot.gripper["right"].current_action = state["gripper"].copy()
+        arm = robot.composite_controller.part_controllers["right"]
+        arm.initial_joint = state["rest_joints"].copy()
+        # Otherwise robosuite goes on from the pose that it saw last.
+        arm.new_update = True
+        env.goal_start = state["goal_start"]
+        self._steps, env.timestep = (int(count) for count in state["steps"])
+        env.cur_time = env.timestep * env.control_timestep
+
+    # -- pictures ------------------------------------------------------------------------------
 
     def render(self) -> np.ndarray | None:
         """Picture of the scene, (height, width, 3) uint8, in mode ``"rgb_array"``."""
         if self.render_mode is None:
             return None
-        model, data = self.robosuite_env.sim.model._model, self.robosuite_env.sim.data._data
-        if self._renderer is None:
-            self._renderer = mujoco.Renderer(model, *self.image_size)
+        env = self.robosuite_env
+        if self._picture is None:
+            # A model of its own, complete: the one that is simulated has no pictures.
+            model = mujoco.MjModel.from_xml_string(env.scene_xml())
+            self._picture = model, mujoco.MjData(model), mujoco.Renderer(model, *self.image_size)
+        model, data, renderer = self._picture
+        simulated = env.sim.model._model
+        model.site_pos[:], model.site_rgba[:] = simulated.site_pos, simulated.site_rgba
+        data.qpos[:] = env.sim.data.qpos
+        mujoco.mj_fwdPosition(model, data)
         options = mujoco.MjvOption()
         options.geomgroup[0] = 0  # collision shapes
-        self._renderer.update_scene(data, camera=self.camera, scene_option=options)
-        return self._renderer.render()
+        renderer.update_scene(data, camera=self.camera, scene_option=options)
+        return renderer.render()
 
     def close(self) -> None:
         """Frees the simulator and the renderer."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        if self._picture is not None:
+            self._picture[-1].close()
+        self._picture = self._fast = None
         self.robosuite_env.close()
+
+
+def _rng_to_array(rng: np.random.Generator) -> np.ndarray:
+    """State of numpy's default generator (PCG64), uint64 (6,)."""
+    state = rng.bit_generator.state
+    low = (1 << 64) - 1
+    words = [
+        (state["state"][name] >> shift) & low for name in ("state", "inc") for shift in (64, 0)
+    ]
+    return np.array([*words, state["has_uint32"], state["uinteger"]], dtype=np.uint64)
+
+
+def _rng_from_array(array: np.ndarray) -> dict[str, Any]:
+    """What :func:`_rng_to_array` was made from."""
+    words = [int(word) for word in array]
+    return {
+        "bit_generator": "PCG64",
+        "state": {"state": words[0] << 64 | words[1], "inc": words[2] << 64 | words[3]},
+        "has_uint32": words[4],
+        "uinteger": words[5],
+    }
 
 
 __all__ = [

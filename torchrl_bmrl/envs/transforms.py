@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import GymEnv, TransformedEnv
+from torchrl.envs import GymEnv, GymWrapper, TransformedEnv
 from torchrl.envs.gym_like import default_info_dict_reader
 from torchrl.envs.transforms import (
     CatTensors,
@@ -139,6 +139,7 @@ def make_env(
     task: str,
     statistics: ObservationStatistics | None = None,
     *transforms: Transform,
+    num_envs: int | None = None,
     **kwargs: object,
 ) -> TransformedEnv:
     """One task as a TorchRL environment with ``observation (33,)``.
@@ -149,19 +150,29 @@ def make_env(
         task: one of the six.
         statistics: of the normalisation.
         *transforms: appended, such as a source of ``task_latent``.
-        **kwargs: of the gymnasium environment, such as ``render_mode``.
+        num_envs: batch size ``[num_envs]``: episodes in one simulator, for a policy that acts in
+            all of them with one call; ``None`` for no batch dimension.
+        **kwargs: of the gymnasium environment, such as ``render_mode`` or ``stepper``.
 
     Raises:
         UnknownNameError: for a name that is not a task.
+        BMRLError: for ``num_envs`` below one.
     """
     # Imported here: the reading of data does not need the simulator.
+    import gymnasium
+
     from torchrl_bmrl.envs.tasks import REWARD_TERMS
 
-    env = GymEnv(f"torchrl_bmrl.envs:{gymnasium_id(task)}", **kwargs)
+    name = f"torchrl_bmrl.envs:{gymnasium_id(task)}"
+    if num_envs is None:
+        env, shape = GymEnv(name, **kwargs), ()
+    else:
+        env, shape = GymWrapper(gymnasium.make_vec(name, num_envs, **kwargs)), (num_envs,)
     keys = ["success", *(f"reward_{name}" for name in REWARD_TERMS)]
     spec = Composite(
-        success=Unbounded((), dtype=torch.bool),
-        **{key: Unbounded((), dtype=torch.float64) for key in keys[1:]},
+        success=Unbounded(shape, dtype=torch.bool),
+        **{key: Unbounded(shape, dtype=torch.float64) for key in keys[1:]},
+        shape=shape,
     )
     env.set_info_dict_reader(default_info_dict_reader(keys, spec=spec))
     return TransformedEnv(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
+from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.names import HORIZON
 
 
@@ -26,38 +27,75 @@ class EpisodeOutcome:
     success: bool
 
 
-def rollout_episode(
-    env: EnvBase, policy: TensorDictModuleBase, *, seed: int, max_steps: int = HORIZON
+def rollout_episodes(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    *,
+    seed: int | Sequence[int],
+    max_steps: int = HORIZON,
+    report: Callable[[int], object] | None = None,
 ) -> TensorDictBase:
-    """One episode; ``seed`` decides the start and what the policy draws.
+    """One episode, or one in each environment of a batch; the policy acts in all with one call.
 
-    PyTorch's global random state is left as it was.
+    ``seed`` decides the starts and what the policy draws. PyTorch's global random state is left as
+    it was.
 
     Args:
-        env: environment with ``observation`` and ``success``.
+        env: environment with ``observation``, batch ``[]`` or ``[N]``.
         policy: writes ``action``.
-        seed: of the episode.
+        seed: of the episode; of each one, N of them, in a batch. The policy draws for all of them
+            from one stream, so that its draws depend on the others.
         max_steps: length.
+        report: called after every step with the number of episodes that advanced.
 
     Returns:
-        the trajectory, batch ``[T]``.
+        the trajectory, batch ``[T]`` or ``[N, T]``.
+
+    Raises:
+        BMRLError: if there are more or fewer seeds than environments.
     """
+    seeds = [seed] if isinstance(seed, int) else list(seed)
+    if len(seeds) != env.numel():
+        raise BMRLError(f"{len(seeds)} seeds for {env.numel()} environments; valid: one for each")
+    callback = None if report is None else lambda *_: report(len(seeds))
     with torch.random.fork_rng(devices=[]), torch.no_grad():
-        torch.manual_seed(seed)
-        return env.rollout(max_steps, policy, tensordict=env.reset(seed=seed), auto_reset=False)
+        torch.manual_seed(seeds[0])
+        start = env.reset(seed=seeds if env.batch_size else seeds[0])
+        return env.rollout(max_steps, policy, tensordict=start, auto_reset=False, callback=callback)
 
 
 def evaluate_policy(
-    env: EnvBase, policy: TensorDictModuleBase, seeds: Sequence[int], *, max_steps: int = HORIZON
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    seeds: Sequence[int],
+    *,
+    max_steps: int = HORIZON,
+    report: Callable[[int], object] | None = None,
 ) -> list[EpisodeOutcome]:
-    """Outcome of one episode per seed."""
-    outcomes = []
-    for seed in seeds:
-        after = rollout_episode(env, policy, seed=seed, max_steps=max_steps).get("next")
-        outcomes.append(
-            EpisodeOutcome(
-                episode_return=after.get("reward").double().sum().item(),
-                success=bool(after.get("success").any()),
-            )
+    """Outcome of one episode per seed, in their order.
+
+    An environment of batch size ``[N]`` plays N of them at a time.
+
+    Args:
+        env: environment with ``observation`` and ``success``, batch ``[]`` or ``[N]``.
+        policy: writes ``action``.
+        seeds: of the episodes; a multiple of N.
+        max_steps: length of an episode.
+        report: called after every step with the number of episodes that advanced.
+
+    Raises:
+        BMRLError: if the seeds do not fill the environments.
+    """
+    outcomes, size = [], env.numel()
+    for first in range(0, len(seeds), size):
+        part = seeds[first : first + size]
+        after = rollout_episodes(env, policy, seed=part, max_steps=max_steps, report=report).get(
+            "next"
         )
+        returns = after.get("reward").double().sum((-2, -1)).reshape(-1)
+        successes = after.get("success").any(-1).reshape(-1)
+        outcomes += [
+            EpisodeOutcome(episode_return, success)
+            for episode_return, success in zip(returns.tolist(), successes.tolist(), strict=True)
+        ]
     return outcomes

@@ -32,6 +32,7 @@ class EpisodeJob:
         noise: standard deviation of the Gaussian noise on each action dimension.
         path: where the episode is kept.
         gains: of the expert.
+        stepper: of :class:`~torchrl_bmrl.envs.tasks.SawyerEnv`.
     """
 
     task: str
@@ -39,29 +40,32 @@ class EpisodeJob:
     noise: float
     path: Path
     gains: ExpertGains = field(default_factory=ExpertGains)
+    stepper: str = "fast"
 
 
 _kept: SawyerEnv | None = None
 
 
-def _env(task: str) -> SawyerEnv:
-    # Building one costs a second, keeping all six a gigabyte a worker: the last one is kept.
+def _env(task: str, stepper: str) -> SawyerEnv:
+    # Building one takes as long as an episode: the last one is kept.
     global _kept
-    if _kept is None or _kept.task != task:
+    if _kept is None or (_kept.task, _kept.stepper) != (task, stepper):
         if _kept is not None:
             _kept.close()
-        _kept = SawyerEnv(task)
+        _kept = SawyerEnv(task, stepper=stepper)
     return _kept
 
 
-def collect_episode(task: str, seed: int, *, noise: float, gains: ExpertGains) -> Episode:
+def collect_episode(
+    task: str, seed: int, *, noise: float, gains: ExpertGains, stepper: str = "fast"
+) -> Episode:
     """One episode of the expert of ``task``, 200 steps, reproduced by ``seed``."""
-    env = _env(task)
+    env = _env(task, stepper)
     observation, _ = env.reset(seed=seed)
     expert = make_expert(task, env.robosuite_env, gains)
     rng = np.random.default_rng(derive_seed(seed, "action noise"))
     observations = {name: [part] for name, part in observation.items()}
-    model_file = env.robosuite_env.sim.model.get_xml()
+    model_file = env.robosuite_env.scene_xml()
     actions, rewards, successes, phases, states = [], [], [], [], []
     for _ in range(HORIZON):
         # What is stored is what was executed, to the bit.
@@ -93,7 +97,8 @@ def collect_episode(task: str, seed: int, *, noise: float, gains: ExpertGains) -
 
 
 def _collect_job(job: EpisodeJob, report: Report) -> None:
-    keep_episode(job.path, collect_episode(job.task, job.seed, noise=job.noise, gains=job.gains))
+    options = {"noise": job.noise, "gains": job.gains, "stepper": job.stepper}
+    keep_episode(job.path, collect_episode(job.task, job.seed, **options))
     report(1)
 
 
@@ -106,6 +111,7 @@ def collect_demonstrations(
     seed: int,
     workers: int,
     gains: ExpertGains | None = None,
+    stepper: str = "fast",
 ) -> dict[str, Path]:
     """Collects demonstrations, one robomimic-layout HDF5 file per task.
 
@@ -120,6 +126,7 @@ def collect_demonstrations(
         seed: episode i of a task is the same in every collection with this seed.
         workers: processes.
         gains: of the experts.
+        stepper: of :class:`~torchrl_bmrl.envs.tasks.SawyerEnv`; the episodes are the same.
 
     Returns:
         the file of each task.
@@ -143,6 +150,7 @@ def collect_demonstrations(
             noise=noise,
             path=path,
             gains=gains,
+            stepper=stepper,
         )
         for task in sorted(parts, key=TASKS.index)
         for i, path in enumerate(parts[task])

@@ -128,8 +128,8 @@ class LiftExpert(Expert):
                 self.phase = 2
             return cube, CLOSE, limit
         top = cube.copy()
-        top[2] = self.env.cube_start[2] + self.gains.lift_height
-        if not self.env.grasped and cube[2] < self.env.cube_start[2] + 0.01:
+        top[2] = self.env.goal_start[2] + self.gains.lift_height
+        if not self.env.grasped and cube[2] < self.env.goal_start[2] + 0.01:
             self.phase, self._closing = 0, 0  # dropped or missed
             return cube + np.array([0.0, 0.0, 0.05]), OPEN, limit
         return top, CLOSE, self.gains.speed_limit

@@ -1,0 +1,140 @@
+"""Many episodes of one task side by side in one simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from torchrl_bmrl.envs.tasks import SawyerEnv
+from torchrl_bmrl.errors import BMRLError
+
+
+class SawyerVectorEnv(VectorEnv):
+    """``num_envs`` episodes of one Sawyer task; an episode costs its state, 1 kB.
+
+    One :class:`~torchrl_bmrl.envs.tasks.SawyerEnv` plays them in turn, each from the state that it
+    had: a policy acts in all of them with one call, and memory stays that of one environment. Each
+    episode equals the one that ``SawyerEnv`` gives, to the bit.
+
+    Nothing resets itself (``AutoresetMode.DISABLED``, what TorchRL's ``GymWrapper`` expects).
+
+    Args:
+        task: one of :data:`torchrl_bmrl.names.TASKS`.
+        num_envs: episodes.
+        **kwargs: of ``SawyerEnv``.
+
+    Raises:
+        BMRLError: for less than one environment, and as ``SawyerEnv``.
+
+    Example:
+        >>> env = SawyerVectorEnv("push_up", num_envs=3)
+        >>> observation, info = env.reset(seed=[4, 5, 6])
+        >>> observation["goal_pos"].shape
+        (3, 3)
+        >>> *_, reward, terminated, truncated, info = env.step(np.zeros((3, 7)))
+        >>> reward.shape, info["success"]
+        ((3,), array([False, False, False]))
+    """
+
+    def __init__(self, task: str, num_envs: int = 1, **kwargs: Any) -> None:
+        if num_envs < 1:
+            raise BMRLError(f"num_envs is {num_envs}; valid: at least 1")
+        self._env = SawyerEnv(task, **kwargs)
+        self.metadata = {**SawyerEnv.metadata, "autoreset_mode": AutoresetMode.DISABLED}
+        self.autoreset_mode = AutoresetMode.DISABLED
+        self.num_envs = num_envs
+        self.render_mode = self._env.render_mode
+        self.single_observation_space = self._env.observation_space
+        self.single_action_space = self._env.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._states: list[dict[str, np.ndarray] | None] = [None] * num_envs
+        self._shown: list[Any] = [None] * num_envs  # what each episode showed last
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Starts episodes.
+
+        Args:
+            seed: of each, or of the first, from which the others count up.
+            options: ``{"reset_mask": mask}`` starts those of a mask ``(num_envs,)`` alone;
+                ``{"states": states}`` goes on from states of :meth:`get_states`.
+
+        Raises:
+            BMRLError: if there are more or fewer seeds or states than environments.
+        """
+        options = options or {}
+        if seed is None or isinstance(seed, int | np.integer):
+            seed = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
+        states = options.get("states", [None] * self.num_envs)
+        mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        for name, rows in (("seeds", seed), ("states", states), ("entries of reset_mask", mask)):
+            if len(rows) != self.num_envs:
+                raise BMRLError(
+                    f"{len(rows)} {name} for {self.num_envs} environments; valid: each one"
+                )
+        for i in np.flatnonzero(mask):
+            wanted = None if states[i] is None else {"state": states[i]}
+            self._shown[i] = self._env.reset(seed=seed[i], options=wanted)
+            self._states[i] = self._env.get_state()
+        if None in self._states:
+            raise BMRLError("reset_mask leaves out episodes that never started")
+        observations, infos = zip(*self._shown, strict=True)
+        return _stack(observations), _stack(infos)
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One control period in every episode.
+
+        Args:
+            actions: ``(num_envs, 7)``.
+
+        Raises:
+            BMRLError: if there is no action for each, or one is not finite; nothing has moved then.
+        """
+        actions = np.asarray(actions, dtype=np.float64)
+        if actions.shape != self.action_space.shape or not np.isfinite(actions).all():
+            raise BMRLError(f"actions are {actions}; valid: finite, {self.action_space.shape}")
+        rows = []
+        for i, (state, action) in enumerate(zip(self._states, actions, strict=True)):
+            if state is None:
+                raise BMRLError("an episode starts with reset")
+            self._env._load_state(state)
+            rows.append(self._env.step(action))
+            self._states[i] = self._env.get_state()
+        observations, rewards, terminated, truncated, infos = zip(*rows, strict=True)
+        self._shown = list(zip(observations, infos, strict=True))
+        return (
+            _stack(observations),
+            np.array(rewards),
+            np.array(terminated),
+            np.array(truncated),
+            _stack(infos),
+        )
+
+    def get_states(self) -> list[dict[str, np.ndarray]]:
+        """State of each episode, as ``SawyerEnv.get_state`` gives it.
+
+        Raises:
+            BMRLError: before the first reset.
+        """
+        if None in self._states:
+            raise BMRLError("an episode starts with reset")
+        return [{name: part.copy() for name, part in state.items()} for state in self._states]
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Frees the simulator."""
+        self._env.close()
+
+
+def _stack(rows: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
+    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
