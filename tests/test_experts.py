@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("robosuite", exc_type=ImportError)
 
-from torchrl_bmrl.envs.tasks import SawyerEnv
+from torchrl_bmrl.envs.sawyer import SawyerEnv
 from torchrl_bmrl.errors import UnknownNameError
 from torchrl_bmrl.experts.collect import collect_episode
 from torchrl_bmrl.experts.controllers import ExpertGains, make_expert

@@ -502,7 +502,7 @@ except BaseException as error:
     print(f"{type(error).__name__}: {error}")
     sys.exit(77)
 import numpy as np
-from torchrl_bmrl.envs.tasks import SawyerEnv
+from torchrl_bmrl.envs.sawyer import SawyerEnv
 env = SawyerEnv("reach", render_mode="rgb_array", image_size=(256, 320))
 env.reset(seed=1)
 shown = env.render()

@@ -153,7 +153,7 @@ def test_a_part_that_never_changes_stays_finite() -> None:
 @pytest.mark.robosuite
 def test_data_and_environment_give_the_same_observation_for_the_same_episode() -> None:
     pytest.importorskip("robosuite", exc_type=ImportError)
-    from torchrl_bmrl.envs.tasks import SawyerEnv
+    from torchrl_bmrl.envs.sawyer import SawyerEnv
     from torchrl_bmrl.envs.transforms import make_env
 
     rng = np.random.default_rng(0)

@@ -13,7 +13,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
-from multiprocessing.pool import RemoteTraceback
+from multiprocessing.pool import RemoteTraceback  # type: ignore[attr-defined]
 from typing import Any, TypeVar
 
 import torch
@@ -113,7 +113,7 @@ class _Worker:
         self.process = context.Process(target=_serve, args=(theirs, function), daemon=True)
         self.process.start()
         theirs.close()  # so that the process's end closes the pipe
-        self.job: int | None = None
+        self.job = -1  # its number
         self.units = 0  # that the job has reported
 
     def begin(self, number: int, job: Any) -> None:
@@ -161,7 +161,6 @@ def _run_in_processes(
             for connection in wait(list(by_connection)):
                 worker = by_connection[connection]
                 number = worker.job
-                assert number is not None
                 try:
                     kind, value = worker.connection.recv()
                 except (EOFError, OSError):
@@ -195,10 +194,8 @@ def _report_death(worker: _Worker, bar: tqdm, number: int, jobs: int, deaths: in
     worker.process.join()
     bar.update(-worker.units)
     code = worker.process.exitcode or 0
-    how = (
-        f"was killed by signal {-code} (out of memory?)" if code < 0 else f"ended with code {code}"
-    )
-    what = f"{bar.desc}: the worker of job {number + 1} of {jobs} {how}"
+    how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
+    what = f"{bar.desc}: the worker of job {number + 1} of {jobs} {how} (out of memory?)"
     if deaths == TRIES:
         raise BMRLError(
             f"{what}, the {TRIES}rd time; what was finished is kept, the same command goes on"

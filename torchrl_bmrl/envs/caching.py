@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import numba
+from numba.core import config
 
 
 def numba_cache_dir() -> Path:
@@ -16,7 +16,7 @@ def numba_cache_dir() -> Path:
     ``NUMBA_CACHE_DIR``, numba's own setting, has precedence.
     """
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(numba.config.CACHE_DIR or Path(home) / "torchrl_bmrl" / "numba")
+    return Path(config.CACHE_DIR or Path(home) / "torchrl_bmrl" / "numba")
 
 
 @contextmanager
@@ -26,9 +26,9 @@ def user_numba_cache() -> Iterator[None]:
     By default numba writes beside the source, which fails in a read-only installation and is lost
     with a container's. Other packages' functions are left where they are.
     """
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(numba_cache_dir())
+    before = config.CACHE_DIR
+    config.CACHE_DIR = str(numba_cache_dir())
     try:
         yield
     finally:
-        numba.config.CACHE_DIR = before
+        config.CACHE_DIR = before

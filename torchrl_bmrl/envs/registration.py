@@ -13,7 +13,7 @@ def register() -> None:
         if gymnasium_id(task) not in gymnasium.registry:
             gymnasium.register(
                 gymnasium_id(task),
-                entry_point="torchrl_bmrl.envs.tasks:SawyerEnv",
+                entry_point="torchrl_bmrl.envs.sawyer:SawyerEnv",
                 vector_entry_point="torchrl_bmrl.envs.vector:SawyerVectorEnv",
                 # Not gymnasium's TimeLimit: its count is not part of a state that one returns to.
                 kwargs={"task": task, "horizon": HORIZON},

@@ -188,9 +188,7 @@ def why_not_fast(env: _BMRLSawyerTask) -> str | None:
     if type(composite) is not CompositeController or len(composite.part_controllers) != 2:
         return f"{type(composite).__name__} is not one arm and one gripper"
     if type(arm) is not OperationalSpaceController or not arm.uncoupling:
-        return (
-            f"{type(arm).__name__} is not operational-space control, position apart from rotation"
-        )
+        return f"{type(arm).__name__} is not operational-space control with uncoupled rotation"
     if type(gripper) is not SimpleGripController:
         return f"{type(gripper).__name__} is not SimpleGripController"
     if any((arm.interpolator_pos, arm.interpolator_ori, gripper.interpolator)):

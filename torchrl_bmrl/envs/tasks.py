@@ -2,7 +2,7 @@
 
 Three robosuite environments (:class:`BMRLSawyerReach`, :class:`BMRLSawyerLift`,
 :class:`BMRLSawyerPush`) hold the physics, the starts, the rewards and the definitions of success.
-:class:`SawyerEnv` shows any of the six tasks as a :class:`gymnasium.Env`.
+:class:`torchrl_bmrl.envs.sawyer.SawyerEnv` shows any of the six as a :class:`gymnasium.Env`.
 
 Reference: *Compositional Skill Learning Using Batch Meta RL*, section 3.
 """
@@ -10,18 +10,15 @@ Reference: *Compositional Skill Learning Using Batch Meta RL*, section 3.
 from __future__ import annotations
 
 import logging
-import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import gymnasium
 import mujoco
 import numpy as np
 
 from torchrl_bmrl.envs.caching import user_numba_cache
-from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.names import PUSH_DIRECTIONS, STEPPERS, TASKS, check_task
+from torchrl_bmrl.errors import UnknownNameError
+from torchrl_bmrl.names import PUSH_DIRECTIONS, TASKS, check_task
 
 # robosuite logs "no private macro file" and controller notes at import and at every construction.
 # A level set before its import is undone by it; a filter stays.
@@ -36,8 +33,6 @@ with user_numba_cache():
     from robosuite.models.tasks import ManipulationTask
     from robosuite.utils.mjcf_utils import new_site
     from robosuite.utils.observables import Observable, sensor
-
-    from torchrl_bmrl.envs.stepper import FastStepper, why_not_fast
 
 CONTROL_FREQUENCY = 20
 """Actions per second [Hz]."""
@@ -127,7 +122,7 @@ class _BMRLSawyerTask(ManipulationEnv):
     """What the tasks share: Sawyer, table, goal marker, a start set by inverse kinematics.
 
     Subclasses place the end-effector, name the goal, and compute reward terms and success. The
-    horizon is not theirs: :class:`SawyerEnv` truncates.
+    horizon is not theirs: ``SawyerEnv`` truncates.
 
     Args:
         seed: of the starts.
@@ -456,274 +451,6 @@ def robosuite_metadata(task: str) -> dict[str, Any]:
     }
 
 
-_PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION
-_said: set[str] = set()
-
-
-class SawyerEnv(gymnasium.Env):
-    """One Sawyer task as a gymnasium environment.
-
-    Observation: a dict of named parts under robosuite's names, float64: ``robot0_joint_pos`` (7,)
-    [rad], ``robot0_gripper_qpos`` (2,) [m], ``robot0_joint_vel`` (7,) [rad/s], ``robot0_eef_pos``
-    (3,) [m], ``robot0_eef_quat`` (4,) xyzw, ``goal_pos`` (3,) [m].
-
-    Action: (7,) in [-1, 1]: position delta (x0.05 m), rotation delta (x0.5 rad), gripper (+1
-    closes, -1 opens).
-
-    ``info``: ``success`` and each reward term as ``reward_<term>``.
-
-    An episode never terminates; the registered ids are truncated after 200 steps.
-
-    Args:
-        task: one of :data:`torchrl_bmrl.names.TASKS`.
-        render_mode: ``None`` or ``"rgb_array"``.
-        camera: robosuite camera for :meth:`render`.
-        image_size: height and width of the rendered picture [pixels].
-        stepper: ``"fast"``, compiled code that gives robosuite's trajectories bit by bit, or
-            ``"robosuite"``. A controller that the first does not cover is left to robosuite, which
-            a warning says once.
-        controller_configs: robosuite's composite controller; by default Sawyer's operational-space
-            control of the pose.
-        horizon: an episode is truncated after so many steps; ``None`` never. (Not gymnasium's
-            ``max_episode_steps``, whose count starts anew when a state is restored.)
-
-    Raises:
-        UnknownNameError: for another task, render mode or stepper.
-
-    Example:
-        >>> env = SawyerEnv("lift")
-        >>> observation, info = env.reset(seed=0)
-        >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
-        >>> terminated, bool(info["success"])
-        (False, False)
-    """
-
-    metadata = {  # noqa: RUF012 (gymnasium's convention)
-        "render_modes": ["rgb_array"],
-        "render_fps": CONTROL_FREQUENCY,
-    }
-
-    def __init__(
-        self,
-        task: str,
-        render_mode: str | None = None,
-        camera: str = "frontview",
-        image_size: tuple[int, int] = (256, 256),
-        *,
-        stepper: str = "fast",
-        controller_configs: dict[str, Any] | None = None,
-        horizon: int | None = None,
-    ) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise UnknownNameError("render_mode", render_mode, ("rgb_array",))
-        if stepper not in STEPPERS:
-            raise UnknownNameError("stepper", stepper, STEPPERS)
-        self.task = task
-        self.render_mode = render_mode
-        self.camera = camera
-        self.image_size = image_size
-        self.stepper = stepper
-        self.horizon = horizon
-        self._steps = 0
-        self._fast: FastStepper | None = None
-        self._picture: tuple[mujoco.MjModel, mujoco.MjData, mujoco.Renderer] | None = None
-        options = {} if controller_configs is None else {"controller_configs": controller_configs}
-        self.robosuite_env = make_robosuite_env(
-            task, use_object_obs=False, lean=stepper == "fast", **options
-        )
-        low, high = self.robosuite_env.action_spec
-        self.action_space = gymnasium.spaces.Box(
-            low.astype(np.float32), high.astype(np.float32), dtype=np.float32
-        )
-        self.observation_space = gymnasium.spaces.Dict(
-            {
-                name: gymnasium.spaces.Box(-np.inf, np.inf, part.shape, dtype=np.float64)
-                for name, part in self.robosuite_env.named_observation().items()
-            }
-        )
-
-    def _info(self, terms: dict[str, float]) -> dict[str, Any]:
-        # numpy scalars: TorchRL's info reader asks every value for its dtype.
-        return {
-            "success": np.bool_(self.robosuite_env._check_success()),
-            **{f"reward_{name}": np.float64(terms.get(name, 0.0)) for name in REWARD_TERMS},
-        }
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Starts an episode; the same ``seed`` gives the same episode.
-
-        Args:
-            seed: of the start and of later unseeded ones.
-            options: ``{"state": state}`` goes on from a state of :meth:`get_state` instead.
-
-        Raises:
-            BMRLError: as :meth:`set_state`.
-        """
-        super().reset(seed=seed)
-        if seed is not None:
-            # In place: assigning robosuite's rng would not reach the samplers that hold it.
-            state = np.random.default_rng(seed).bit_generator.state
-            self.robosuite_env.rng.bit_generator.state = state
-        if options and "state" in options:
-            self.set_state(options["state"])
-        else:
-            self._steps = 0
-            self.robosuite_env.reset()
-        return self.robosuite_env.named_observation(), self._info({})
-
-    def step(
-        self, action: np.ndarray
-    ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """Acts for one control period (50 ms).
-
-        Raises:
-            BMRLError: if the action has another shape or is not finite; nothing has moved then.
-        """
-        action = np.asarray(action, dtype=np.float64)
-        if action.shape != self.action_space.shape or not np.isfinite(action).all():
-            shape = f"({self.action_space.shape[0]},)"
-            raise BMRLError(f"action is {action}; valid: finite, of shape {shape}")
-        self._advance(action)
-        self._steps += 1
-        terms = self.robosuite_env.reward_terms()
-        observation = self.robosuite_env.named_observation()
-        truncated = self.horizon is not None and self._steps >= self.horizon
-        return observation, sum(terms.values()), False, truncated, self._info(terms)
-
-    def _advance(self, action: np.ndarray) -> None:
-        env = self.robosuite_env
-        if self.stepper == "fast" and (self._fast is None or not self._fast.serves(env)):
-            self._fast = None
-            if (reason := why_not_fast(env)) is None:
-                self._fast = FastStepper(env)
-            elif reason not in _said:
-                _said.add(reason)
-                warnings.warn(f"steps are robosuite's own, and slow: {reason}", stacklevel=3)
-        if self._fast is None:
-            env.step(action)
-            return
-        self._fast.step(action)
-        env.timestep += 1
-        env.cur_time += env.control_timestep
-
-    # -- state ---------------------------------------------------------------------------------
-
-    def get_state(self) -> dict[str, np.ndarray]:
-        """Everything that decides how the episode goes on, at any step, as arrays.
-
-        ``physics``: MuJoCo's integration state (positions, velocities, warm start, controls, time);
-        ``gripper`` and ``rest_joints``: what robosuite's gripper and arm controllers remember;
-        ``goal_start``; ``steps`` taken; ``rng``: of the starts to come. ``np.savez`` keeps it.
-
-        Exact for Sawyer's own controller and every other that does not interpolate goals.
-        """
-        env, robot = self.robosuite_env, self.robosuite_env.robots[0]
-        model, data = env.sim.model._model, env.sim.data._data
-        physics = np.empty(mujoco.mj_stateSize(model, _PHYSICS))
-        mujoco.mj_getState(model, data, physics, _PHYSICS)
-        arm = robot.composite_controller.part_controllers["right"]
-        return {
-            "physics": physics,
-            "gripper": np.array(robot.gripper["right"].current_action, dtype=np.float64),
-            "rest_joints": np.array(arm.initial_joint, dtype=np.float64),
-            "goal_start": env.goal_start,
-            "steps": np.array([self._steps, env.timestep]),
-            "rng": _rng_to_array(env.rng),
-        }
-
-    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Goes back to a state of :meth:`get_state`, of this environment or of another one.
-
-        What follows equals never having left, in the task at hand: states of lift and of the four
-        pushes can be exchanged.
-
-        Raises:
-            BMRLError: if an array is missing, too many, of another shape or not finite; nothing has
-                changed then.
-        """
-        now = self.get_state()
-        if state.keys() != now.keys():
-            raise BMRLError(f"a state has {sorted(state)}; valid: {sorted(now)}")
-        arrays = {name: np.asarray(state[name]) for name in now}
-        for name, array in arrays.items():
-            valid = now[name]
-            if array.shape != valid.shape or array.dtype != valid.dtype:
-                raise BMRLError(
-                    f"{name} of the state is {array.dtype} {array.shape}; valid here ({self.task}): "
-                    f"{valid.dtype} {valid.shape}"
-                )
-            if not np.isfinite(array).all():
-                raise BMRLError(f"{name} of the state is {array}; valid: finite")
-        self._load_state(arrays)
-        env = self.robosuite_env
-        mujoco.mj_fwdPosition(env.sim.model._model, env.sim.data._data)
-        env.rng.bit_generator.state = _rng_from_array(arrays["rng"])
-
-    def _load_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """The state, but neither the poses that follow from it nor the random numbers to come."""
-        env, robot = self.robosuite_env, self.robosuite_env.robots[0]
-        mujoco.mj_setState(env.sim.model._model, env.sim.data._data, state["physics"], _PHYSICS)
-        robot.gripper["right"].current_action = state["gripper"].copy()
-        arm = robot.composite_controller.part_controllers["right"]
-        arm.initial_joint = state["rest_joints"].copy()
-        # Otherwise robosuite goes on from the pose that it saw last.
-        arm.new_update = True
-        env.goal_start = state["goal_start"]
-        self._steps, env.timestep = (int(count) for count in state["steps"])
-        env.cur_time = env.timestep * env.control_timestep
-
-    # -- pictures ------------------------------------------------------------------------------
-
-    def render(self) -> np.ndarray | None:
-        """Picture of the scene, (height, width, 3) uint8, in mode ``"rgb_array"``."""
-        if self.render_mode is None:
-            return None
-        env = self.robosuite_env
-        if self._picture is None:
-            # A model of its own, complete: the one that is simulated has no pictures.
-            model = mujoco.MjModel.from_xml_string(env.scene_xml())
-            self._picture = model, mujoco.MjData(model), mujoco.Renderer(model, *self.image_size)
-        model, data, renderer = self._picture
-        simulated = env.sim.model._model
-        model.site_pos[:], model.site_rgba[:] = simulated.site_pos, simulated.site_rgba
-        data.qpos[:] = env.sim.data.qpos
-        mujoco.mj_fwdPosition(model, data)
-        options = mujoco.MjvOption()
-        options.geomgroup[0] = 0  # collision shapes
-        renderer.update_scene(data, camera=self.camera, scene_option=options)
-        return renderer.render()
-
-    def close(self) -> None:
-        """Frees the simulator and the renderer."""
-        if self._picture is not None:
-            self._picture[-1].close()
-        self._picture = self._fast = None
-        self.robosuite_env.close()
-
-
-def _rng_to_array(rng: np.random.Generator) -> np.ndarray:
-    """State of numpy's default generator (PCG64), uint64 (6,)."""
-    state = rng.bit_generator.state
-    low = (1 << 64) - 1
-    words = [
-        (state["state"][name] >> shift) & low for name in ("state", "inc") for shift in (64, 0)
-    ]
-    return np.array([*words, state["has_uint32"], state["uinteger"]], dtype=np.uint64)
-
-
-def _rng_from_array(array: np.ndarray) -> dict[str, Any]:
-    """What :func:`_rng_to_array` was made from."""
-    words = [int(word) for word in array]
-    return {
-        "bit_generator": "PCG64",
-        "state": {"state": words[0] << 64 | words[1], "inc": words[2] << 64 | words[3]},
-        "has_uint32": words[4],
-        "uinteger": words[5],
-    }
-
-
 __all__ = [
     "CONTROL_FREQUENCY",
     "REWARD_TERMS",
@@ -731,7 +458,6 @@ __all__ = [
     "BMRLSawyerLift",
     "BMRLSawyerPush",
     "BMRLSawyerReach",
-    "SawyerEnv",
     "make_robosuite_env",
     "push_velocity_reward",
     "reach_reward",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -140,7 +141,7 @@ def make_env(
     statistics: ObservationStatistics | None = None,
     *transforms: Transform,
     num_envs: int | None = None,
-    **kwargs: object,
+    **kwargs: Any,
 ) -> TransformedEnv:
     """One task as a TorchRL environment with ``observation (33,)``.
 
@@ -164,10 +165,12 @@ def make_env(
     from torchrl_bmrl.envs.tasks import REWARD_TERMS
 
     name = f"torchrl_bmrl.envs:{gymnasium_id(task)}"
-    if num_envs is None:
-        env, shape = GymEnv(name, **kwargs), ()
-    else:
-        env, shape = GymWrapper(gymnasium.make_vec(name, num_envs, **kwargs)), (num_envs,)
+    env = (
+        GymEnv(name, **kwargs)
+        if num_envs is None
+        else GymWrapper(gymnasium.make_vec(name, num_envs, **kwargs))
+    )
+    shape = env.batch_size
     keys = ["success", *(f"reward_{name}" for name in REWARD_TERMS)]
     spec = Composite(
         success=Unbounded(shape, dtype=torch.bool),

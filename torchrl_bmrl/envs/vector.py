@@ -9,14 +9,14 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from torchrl_bmrl.envs.tasks import SawyerEnv
+from torchrl_bmrl.envs.sawyer import SawyerEnv
 from torchrl_bmrl.errors import BMRLError
 
 
 class SawyerVectorEnv(VectorEnv):
     """``num_envs`` episodes of one Sawyer task; an episode costs its state, 1 kB.
 
-    One :class:`~torchrl_bmrl.envs.tasks.SawyerEnv` plays them in turn, each from the state that it
+    One :class:`~torchrl_bmrl.envs.sawyer.SawyerEnv` plays them in turn, each from the state that it
     had: a policy acts in all of them with one call, and memory stays that of one environment. Each
     episode equals the one that ``SawyerEnv`` gives, to the bit.
 
@@ -105,10 +105,8 @@ class SawyerVectorEnv(VectorEnv):
         if actions.shape != self.action_space.shape or not np.isfinite(actions).all():
             raise BMRLError(f"actions are {actions}; valid: finite, {self.action_space.shape}")
         rows = []
-        for i, (state, action) in enumerate(zip(self._states, actions, strict=True)):
-            if state is None:
-                raise BMRLError("an episode starts with reset")
-            self._env._load_state(state)
+        for i, action in enumerate(actions):
+            self._env._load_state(self._state(i))
             rows.append(self._env.step(action))
             self._states[i] = self._env.get_state()
         observations, rewards, terminated, truncated, infos = zip(*rows, strict=True)
@@ -127,9 +125,13 @@ class SawyerVectorEnv(VectorEnv):
         Raises:
             BMRLError: before the first reset.
         """
-        if None in self._states:
+        states = [self._state(i) for i in range(self.num_envs)]
+        return [{name: part.copy() for name, part in state.items()} for state in states]
+
+    def _state(self, i: int) -> dict[str, np.ndarray]:
+        if (state := self._states[i]) is None:
             raise BMRLError("an episode starts with reset")
-        return [{name: part.copy() for name, part in state.items()} for state in self._states]
+        return state
 
     def close_extras(self, **kwargs: Any) -> None:
         """Frees the simulator."""

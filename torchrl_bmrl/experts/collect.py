@@ -15,7 +15,8 @@ from torchrl_bmrl.data.robomimic import (
     read_kept_episode,
     write_episodes,
 )
-from torchrl_bmrl.envs.tasks import SawyerEnv, robosuite_metadata
+from torchrl_bmrl.envs.sawyer import SawyerEnv
+from torchrl_bmrl.envs.tasks import robosuite_metadata
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.experts.controllers import ExpertGains, make_expert
 from torchrl_bmrl.names import HORIZON, TASKS, check_task
@@ -32,7 +33,7 @@ class EpisodeJob:
         noise: standard deviation of the Gaussian noise on each action dimension.
         path: where the episode is kept.
         gains: of the expert.
-        stepper: of :class:`~torchrl_bmrl.envs.tasks.SawyerEnv`.
+        stepper: of :class:`~torchrl_bmrl.envs.sawyer.SawyerEnv`.
     """
 
     task: str
@@ -97,8 +98,10 @@ def collect_episode(
 
 
 def _collect_job(job: EpisodeJob, report: Report) -> None:
-    options = {"noise": job.noise, "gains": job.gains, "stepper": job.stepper}
-    keep_episode(job.path, collect_episode(job.task, job.seed, **options))
+    episode = collect_episode(
+        job.task, job.seed, noise=job.noise, gains=job.gains, stepper=job.stepper
+    )
+    keep_episode(job.path, episode)
     report(1)
 
 
@@ -126,7 +129,7 @@ def collect_demonstrations(
         seed: episode i of a task is the same in every collection with this seed.
         workers: processes.
         gains: of the experts.
-        stepper: of :class:`~torchrl_bmrl.envs.tasks.SawyerEnv`; the episodes are the same.
+        stepper: of :class:`~torchrl_bmrl.envs.sawyer.SawyerEnv`; the episodes are the same.
 
     Returns:
         the file of each task.
