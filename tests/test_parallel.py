@@ -6,6 +6,7 @@ import os
 import pickle
 import signal
 import time
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,6 +14,7 @@ import torch
 
 pytest.importorskip("tqdm")
 
+from torchrl_bmrl import parallel
 from torchrl_bmrl.errors import (
     BMRLError,
     CheckpointError,
@@ -35,13 +37,6 @@ def work(job: tuple[int, float], report: Report) -> dict[str, Any]:
     return {"number": number, "sum": product.sum().item(), "threads": torch.get_num_threads()}
 
 
-def die(job: str, report: Report) -> str:
-    report(1)
-    if job == "killed":
-        os.kill(os.getpid(), signal.SIGKILL)
-    return job
-
-
 def fail(job: str, report: Report) -> None:
     raise CheckpointError(f"runs/{job}", "no manifest")
 
@@ -62,10 +57,61 @@ def test_two_workers_give_the_results_of_one_in_the_jobs_order(
     assert "OMP_NUM_THREADS" not in os.environ
 
 
+def die_until(job: tuple[str, Path, int], report: Report) -> str:
+    """Reports one unit and is killed, so often; then reports two and returns."""
+    name, folder, deaths = job
+    report(1)
+    tries = folder / name
+    tries.write_text(tries.read_text() + "x" if tries.exists() else "x")
+    if len(tries.read_text()) <= deaths:
+        os.kill(os.getpid(), signal.SIGKILL)
+    report(1)
+    return name
+
+
 @pytest.mark.slow
-def test_a_killed_worker_ends_the_run_with_a_message() -> None:
-    with pytest.raises(BMRLError, match="stage 1: training: a worker process was killed"):
-        run_jobs(die, ["fine", "killed", "fine"], workers=2, **OPTIONS)
+def test_the_job_of_a_killed_worker_is_reported_and_done_again_and_no_other(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    updates: list[int] = []
+    bar = type("Bar", (parallel.tqdm,), {"update": lambda bar, n: updates.append(n)})
+    monkeypatch.setattr(parallel, "tqdm", bar)
+    jobs = [(name, tmp_path, deaths) for name, deaths in zip("abcd", (0, 2, 0, 0), strict=True)]
+    assert run_jobs(die_until, jobs, workers=2, **OPTIONS) == ["a", "b", "c", "d"]
+    assert [len((tmp_path / name).read_text()) for name in "abcd"] == [1, 3, 1, 1]
+    assert sum(updates) == 8
+    assert updates.count(-1) == 2
+    said = [line for line in capfd.readouterr().err.splitlines() if "killed" in line]
+    assert len(said) == 2
+    assert "a worker was killed by signal 9 (out of memory?) in job 2 of 4" in said[0]
+    assert "done again" in said[1]
+
+
+@pytest.mark.slow
+def test_a_job_that_kills_its_worker_every_time_ends_the_run_with_a_message(
+    tmp_path: Path,
+) -> None:
+    jobs = [("fine", tmp_path, 0), ("killed", tmp_path, 9)]
+    with pytest.raises(BMRLError, match=r"stage 1: training: a worker was killed.* 3rd time"):
+        run_jobs(die_until, jobs, workers=2, **OPTIONS)
+    assert len((tmp_path / "killed").read_text()) == parallel.TRIES
+
+
+def fail_unexpectedly(job: int, report: Report) -> None:
+    raise ZeroDivisionError(f"job {job}")
+
+
+@pytest.mark.slow
+def test_an_unexpected_error_of_a_worker_comes_with_its_traceback() -> None:
+    with pytest.raises(ZeroDivisionError, match="job 1") as caught:
+        run_jobs(fail_unexpectedly, [1, 1], workers=2, **OPTIONS)
+    assert "in fail_unexpectedly" in str(caught.value.__cause__)
+
+
+@pytest.mark.slow
+def test_an_expected_error_of_a_worker_arrives_whole() -> None:
+    with pytest.raises(CheckpointError, match="runs/lift"):
+        run_jobs(fail, ["lift", "lift"], workers=2, **OPTIONS)
 
 
 @pytest.mark.parametrize(

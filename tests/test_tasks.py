@@ -20,6 +20,7 @@ from gymnasium.utils.env_checker import check_env
 from torchrl.envs.utils import check_env_specs
 
 import torchrl_bmrl.envs  # registers the ids  # noqa: F401
+from torchrl_bmrl.envs.sawyer import SawyerEnv
 from torchrl_bmrl.envs.tasks import (
     CUBE_HALF_SIZE,
     CUBE_RANGE,
@@ -29,7 +30,6 @@ from torchrl_bmrl.envs.tasks import (
     REACH_START,
     REWARD_TERMS,
     TABLE_TOP,
-    SawyerEnv,
     make_robosuite_env,
     robosuite_metadata,
 )

@@ -88,7 +88,7 @@ def run_jobs(
             finally:
                 torch.set_num_threads(threads)
         with _one_thread_each():
-            return _run_in_processes(function, jobs, min(workers, len(jobs)), bar)
+            return _run_in_processes(function, jobs, workers, bar, description)
 
 
 @contextmanager
@@ -147,7 +147,11 @@ def _end_with_parent() -> None:
 
 
 def _run_in_processes(
-    function: Callable[[Job, Report], Result], jobs: list[Job], workers: int, bar: tqdm
+    function: Callable[[Job, Report], Result],
+    jobs: list[Job],
+    workers: int,
+    bar: tqdm,
+    description: str,
 ) -> list[Result]:
     waiting, deaths = deque(range(len(jobs))), Counter[int]()
     results: dict[int, Result] = {}
@@ -164,17 +168,25 @@ def _run_in_processes(
                 try:
                     kind, value = worker.connection.recv()
                 except (EOFError, OSError):
-                    pool.remove(worker)
-                    deaths[number] += 1
-                    _report_death(worker, bar, number, len(jobs), deaths[number])
-                    waiting.appendleft(number)
-                    continue
+                    kind, value = "death", _death(worker)
                 if kind == "report":
                     worker.units += value
                     bar.update(value)
                 elif kind == "error":
                     error, text = value
                     raise error from RemoteTraceback(text)
+                elif kind == "death":
+                    pool.remove(worker)
+                    bar.update(-worker.units)  # to be reported anew
+                    deaths[number] += 1
+                    what = f"{description}: a worker {value} in job {number + 1} of {len(jobs)}"
+                    if deaths[number] == TRIES:
+                        raise BMRLError(
+                            f"{what}, the {TRIES}rd time; what was finished is kept, the same "
+                            "command goes on"
+                        )
+                    tqdm.write(f"{what}; the job is done again", file=sys.stderr)
+                    waiting.appendleft(number)
                 else:
                     results[number] = value
                     if waiting:
@@ -190,17 +202,10 @@ def _run_in_processes(
             worker.process.join()
 
 
-def _report_death(worker: _Worker, bar: tqdm, number: int, jobs: int, deaths: int) -> None:
+def _death(worker: _Worker) -> str:
     worker.process.join()
-    bar.update(-worker.units)
     code = worker.process.exitcode or 0
-    how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
-    what = f"{bar.desc}: the worker of job {number + 1} of {jobs} {how} (out of memory?)"
-    if deaths == TRIES:
-        raise BMRLError(
-            f"{what}, the {TRIES}rd time; what was finished is kept, the same command goes on"
-        )
-    tqdm.write(f"{what}; the job is done again", file=sys.stderr)
+    return f"was killed by signal {-code} (out of memory?)" if code < 0 else f"ended, code {code},"
 
 
 def derive_seed(seed: int, *names: str | int) -> int:

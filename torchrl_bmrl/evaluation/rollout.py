@@ -57,11 +57,21 @@ def rollout_episodes(
     seeds = [seed] if isinstance(seed, int) else list(seed)
     if len(seeds) != env.numel():
         raise BMRLError(f"{len(seeds)} seeds for {env.numel()} environments; valid: one for each")
-    callback = None if report is None else lambda *_: report(len(seeds))
+    reported = 0
+
+    def callback(*_: object) -> None:
+        nonlocal reported
+        if report is not None:
+            reported += len(seeds)
+            report(len(seeds))
+
     with torch.random.fork_rng(devices=[]), torch.no_grad():
         torch.manual_seed(seeds[0])
         start = env.reset(seed=seeds if env.batch_size else seeds[0])
-        return env.rollout(max_steps, policy, tensordict=start, auto_reset=False, callback=callback)
+        data = env.rollout(max_steps, policy, tensordict=start, auto_reset=False, callback=callback)
+    if report is not None:
+        report(data.numel() - reported)  # TorchRL calls back between steps: not after the last
+    return data
 
 
 def evaluate_policy(

@@ -1,0 +1,258 @@
+"""Saved states go on as if nothing had happened in between, alone and many side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("robosuite", exc_type=ImportError)
+
+import gymnasium
+import torch
+from torchrl.envs.utils import check_env_specs
+
+import torchrl_bmrl.envs  # registers the ids  # noqa: F401
+from torchrl_bmrl.envs.sawyer import SawyerEnv
+from torchrl_bmrl.envs.transforms import make_env
+from torchrl_bmrl.envs.vector import SawyerVectorEnv
+from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.names import STEPPERS, TASKS, gymnasium_id
+
+pytestmark = pytest.mark.robosuite
+
+ACTIONS = np.random.default_rng(0).uniform(-1, 1, (60, 7))
+ACTIONS[:, 2] -= 0.6  # down: fingers, cube and table touch
+ACTIONS[:, 6] = np.sign(np.sin(np.arange(60)))  # the gripper is never at rest
+
+
+@pytest.fixture(scope="module")
+def envs() -> Iterator[dict[str, SawyerEnv]]:
+    made = {task: SawyerEnv(task) for task in ("reach", "lift", "push_left")}
+    yield made
+    for env in made.values():
+        env.close()
+
+
+def rows(env: SawyerEnv, actions: np.ndarray) -> np.ndarray:
+    """Everything that steps show, and where they lead."""
+    seen = []
+    for action in actions:
+        observation, reward, _, truncated, info = env.step(action)
+        parts = np.concatenate([*observation.values()])
+        data = env.robosuite_env.sim.data
+        seen.append([reward, truncated, *parts, *map(float, info.values()), *data.qpos, *data.qvel])
+    return np.array(seen)
+
+
+@pytest.mark.parametrize("steps", [0, 1, 25])
+@pytest.mark.parametrize("stepper", STEPPERS)
+@pytest.mark.parametrize("task", ["reach", "lift", "push_left"])
+def test_restoring_equals_never_having_left(task: str, stepper: str, steps: int) -> None:
+    env, other = SawyerEnv(task, stepper=stepper), SawyerEnv(task)
+    env.reset(seed=1)
+    rows(env, ACTIONS[:steps])
+    state = env.get_state()
+    stayed = rows(env, ACTIONS[steps : steps + 15])
+    rows(env, -ACTIONS[:7])
+    env.set_state(state)
+    np.testing.assert_array_equal(rows(env, ACTIONS[steps : steps + 15]), stayed)
+    other.reset(seed=9)
+    rows(other, ACTIONS[:3])
+    other.set_state(state)
+    np.testing.assert_array_equal(rows(other, ACTIONS[steps : steps + 15]), stayed)
+    for one in (env, other):
+        one.close()
+
+
+def test_a_state_comes_back_from_a_file_with_observation_time_limit_and_next_start(
+    tmp_path: Path,
+) -> None:
+    env = SawyerEnv("push_left", horizon=12)
+    env.reset(seed=5)
+    for action in ACTIONS[:10]:
+        observation, _, _, truncated, info = env.step(action)
+        assert not truncated
+    np.savez(tmp_path / "state.npz", **env.get_state())
+    rest = [env.step(action) for action in ACTIONS[10:12]]
+    following, _ = env.reset()
+    fresh = SawyerEnv("push_left", horizon=12)
+    with np.load(tmp_path / "state.npz") as state:
+        shown, shown_info = fresh.reset(options={"state": state})
+    for name, part in observation.items():
+        np.testing.assert_array_equal(shown[name], part)
+    assert shown_info["success"] == info["success"]
+    again = [fresh.step(action) for action in ACTIONS[10:12]]
+    assert [step[3] for step in again] == [step[3] for step in rest] == [False, True]
+    np.testing.assert_array_equal(fresh.reset()[0]["goal_pos"], following["goal_pos"])
+    for one in (env, fresh):
+        one.close()
+
+
+def test_a_state_of_one_task_goes_on_in_another_with_its_rewards(
+    envs: dict[str, SawyerEnv],
+) -> None:
+    lift, push = envs["lift"], envs["push_left"]
+    lift.reset(seed=2)
+    rows(lift, ACTIONS[:8])
+    push.reset(seed=3)
+    push.set_state(lift.get_state())
+    theirs, ours = (env.step(ACTIONS[8]) for env in (lift, push))
+    for name, part in theirs[0].items():
+        np.testing.assert_array_equal(ours[0][name], part)
+    assert theirs[4]["reward_velocity"] == 0 < ours[4]["reward_velocity"]
+
+
+BAD = {
+    "missing": lambda state: state.pop("gripper"),
+    "unknown": lambda state: state.update(colour=np.zeros(3)),
+    "shape": lambda state: state.update(physics=state["physics"][:-1]),
+    "kind": lambda state: state.update(steps=np.array([1.0, 1.0])),
+    "nan": lambda state: state.update(rest_joints=np.full(7, np.nan)),
+}
+
+
+@pytest.mark.parametrize("fault", BAD)
+def test_a_bad_state_is_refused_and_changes_nothing(envs: dict[str, SawyerEnv], fault: str) -> None:
+    env = envs["lift"]
+    env.reset(seed=0)
+    state = env.get_state()
+    rows(env, ACTIONS[:3])
+    now = env.get_state()
+    BAD[fault](state)
+    name = {"missing": "gripper", "unknown": "colour", "shape": "physics", "kind": "steps"}
+    with pytest.raises(BMRLError, match=name.get(fault, "rest_joints")):
+        env.set_state(state)
+    for key, part in env.get_state().items():
+        np.testing.assert_array_equal(part, now[key])
+
+
+def test_a_reach_state_does_not_fit_a_task_with_a_cube(envs: dict[str, SawyerEnv]) -> None:
+    envs["reach"].reset(seed=0)
+    with pytest.raises(BMRLError, match=r"physics.*lift"):
+        envs["lift"].set_state(envs["reach"].get_state())
+
+
+# -- many side by side -----------------------------------------------------------------------------
+
+
+def test_each_episode_side_by_side_equals_the_one_alone() -> None:
+    seeds = [7, 3, 11]
+    vector, env = SawyerVectorEnv("lift", num_envs=3, horizon=20), SawyerEnv("lift", horizon=20)
+    actions = np.stack([ACTIONS[:20], -ACTIONS[:20], ACTIONS[20:40]], 1)
+    shown = [vector.reset(seed=seeds), *(vector.step(action) for action in actions)]
+    for i, seed in enumerate(seeds):
+        alone = [env.reset(seed=seed), *(env.step(action) for action in actions[:, i])]
+        for theirs, ours in zip(shown, alone, strict=True):
+            for name, part in ours[0].items():
+                np.testing.assert_array_equal(theirs[0][name][i], part)
+            assert {name: value[i] for name, value in theirs[-1].items()} == ours[-1]
+            for several, single in zip(theirs[1:-1], ours[1:-1], strict=True):
+                assert several[i] == single
+    vector.close()
+    env.close()
+
+
+def test_some_episodes_start_anew_while_others_go_on() -> None:
+    vector = SawyerVectorEnv("push_left", num_envs=3)
+    before, _ = vector.reset(seed=0)
+    again, _ = vector.reset(seed=0)
+    np.testing.assert_array_equal(before["goal_pos"], again["goal_pos"])
+    assert len(np.unique(before["goal_pos"].round(6), axis=0)) == 3
+    observation, *_ = vector.step(np.stack([ACTIONS[0]] * 3))
+    mask = np.array([False, True, False])
+    after, info = vector.reset(seed=[20, 21, 22], options={"reset_mask": mask})
+    for name, part in observation.items():
+        np.testing.assert_array_equal(after[name][~mask], part[~mask])
+    assert not np.array_equal(after["goal_pos"][1], observation["goal_pos"][1])
+    assert (info["reward_reach"] > 0).tolist() == [True, False, True]  # a reset gives no reward
+    states = vector.get_states()
+    gone_on, *_ = vector.step(np.stack([ACTIONS[1]] * 3))
+    vector.reset(options={"states": states})
+    restored, *_ = vector.step(np.stack([ACTIONS[1]] * 3))
+    for name, part in gone_on.items():
+        np.testing.assert_array_equal(restored[name], part)
+    vector.close()
+
+
+def test_bad_calls_of_a_vector_environment_are_answered() -> None:
+    with pytest.raises(BMRLError, match="num_envs is 0"):
+        SawyerVectorEnv("reach", num_envs=0)
+    vector = SawyerVectorEnv("reach", num_envs=2)
+    with pytest.raises(BMRLError, match="starts with reset"):
+        vector.step(np.zeros((2, 7)))
+    with pytest.raises(BMRLError, match="3 seeds for 2 environments"):
+        vector.reset(seed=[1, 2, 3])
+    with pytest.raises(BMRLError, match="never started"):
+        vector.reset(options={"reset_mask": np.array([True, False])})
+    vector.reset(seed=0)
+    before = vector.get_states()
+    bad = np.zeros((2, 7))
+    bad[1, 3] = np.nan
+    for actions in (bad, np.zeros(7)):
+        with pytest.raises(BMRLError, match=r"finite, \(2, 7\)"):
+            vector.step(actions)
+    for state, then in zip(vector.get_states(), before, strict=True):
+        np.testing.assert_array_equal(state["physics"], then["physics"])
+    vector.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_torchrl_and_gymnasium_take_the_vector_environment(task: str) -> None:
+    made = gymnasium.make_vec(gymnasium_id(task), num_envs=2)
+    assert isinstance(made, SawyerVectorEnv)
+    made.close()
+    env = make_env(task, num_envs=2)
+    assert env.batch_size == (2,)
+    check_env_specs(env, seed=0)
+    env.close()
+
+
+def test_a_batch_in_torchrl_shows_what_single_environments_show() -> None:
+    single, batch = make_env("push_left"), make_env("push_left", num_envs=2)
+    actions = torch.tensor(ACTIONS[:6], dtype=torch.float32)
+
+    def play(env: Any, data: Any, stack: Any) -> list[Any]:
+        steps = []
+        for action in actions:
+            data = env.step(data.set("action", stack(action)))["next"]
+            steps.append(data)
+        return steps
+
+    several = play(batch, batch.reset(seed=[4, 5]), lambda action: action.expand(2, 7))
+    for i, seed in enumerate((4, 5)):
+        alone = play(single, single.reset(seed=seed), lambda action: action)
+        for theirs, ours in zip(several, alone, strict=True):
+            assert theirs[i].keys() == ours.keys()
+            for key, value in ours.items():
+                torch.testing.assert_close(theirs[i][key], value, rtol=0, atol=0)
+    for env in (single, batch):
+        env.close()
+
+
+def test_torchrl_goes_on_from_a_state() -> None:
+    env = make_env("lift")
+    data = env.reset(seed=0)
+    for action in ACTIONS[:4]:
+        data = env.step(data.set("action", torch.tensor(action).float()))["next"]
+    state = env.base_env.unwrapped.get_state()
+    action = torch.tensor(ACTIONS[4]).float()
+    stayed = env.step(data.clone().set("action", action))["next", "observation"]
+    back = env.reset(options={"state": state})
+    torch.testing.assert_close(back["observation"], data["observation"], rtol=0, atol=0)
+    again = env.step(back.set("action", action))["next", "observation"]
+    torch.testing.assert_close(again, stayed, rtol=0, atol=0)
+    env.close()
+
+
+def test_torchrl_starts_some_episodes_of_a_batch_anew() -> None:
+    env = make_env("reach", num_envs=3, horizon=4)
+    torch.manual_seed(0)
+    data = env.rollout(10, break_when_any_done=False)
+    env.close()
+    assert data["next", "truncated"].squeeze(-1).sum(1).tolist() == [2, 2, 2]
+    goals = data["observation"][..., -3:]
+    assert [len(goals[i].unique(dim=0)) for i in range(3)] == [3, 3, 3]  # 4 + 4 + 2 steps
