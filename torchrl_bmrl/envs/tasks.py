@@ -30,6 +30,7 @@ with user_numba_cache():
     from robosuite.environments.manipulation.manipulation_env import ManipulationEnv
     from robosuite.models.arenas import TableArena
     from robosuite.models.objects import BoxObject
+    from robosuite.models.robots import RobotModel
     from robosuite.models.tasks import ManipulationTask
     from robosuite.utils.mjcf_utils import new_site
     from robosuite.utils.observables import Observable, sensor
@@ -150,6 +151,17 @@ class _BMRLSawyerTask(ManipulationEnv):
 
     # -- model ---------------------------------------------------------------------------------
 
+    def _load_robots(self) -> None:
+        if not self.lean:
+            return super()._load_robots()
+        # robosuite compiles the robot alone, too, with all its meshes: 300 MB that nothing reads.
+        compile_robot = RobotModel.set_mujoco_model
+        RobotModel.set_mujoco_model = lambda model: None
+        try:
+            return super()._load_robots()
+        finally:
+            RobotModel.set_mujoco_model = compile_robot
+
     def _load_model(self) -> None:
         super()._load_model()
         model = self.robots[0].robot_model
@@ -167,8 +179,6 @@ class _BMRLSawyerTask(ManipulationEnv):
             self.cube = BoxObject("cube", size_min=half, size_max=half, rgba=[0.8, 0.2, 0.1, 1])
             objects.append(self.cube)
         self.model = (_LeanTask if self.lean else ManipulationTask)(arena, [model], objects)
-        if self.lean:
-            model.mujoco_model = None  # a second robot, 60 MB, for robosuite's whole-body IK
         self.model.worldbody.append(
             new_site("goal_marker", pos=(0, 0, 1), size=(0.015,), rgba=(1, 0.1, 0.1, 0.7), group=1)
         )

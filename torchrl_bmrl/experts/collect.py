@@ -48,7 +48,7 @@ _kept: SawyerEnv | None = None
 
 
 def _env(task: str, stepper: str) -> SawyerEnv:
-    # Building one takes as long as an episode: the last one is kept.
+    # Building one with its pictures takes a second: the last one is kept.
     global _kept
     if _kept is None or (_kept.task, _kept.stepper) != (task, stepper):
         if _kept is not None:
