@@ -231,6 +231,9 @@ def test_reasons_against_the_fast_step(monkeypatch: pytest.MonkeyPatch) -> None:
         patch.setattr(stepper, "opspace_matrices", lambda *_: None)
         assert "ENABLE_NUMBA" in (why_not_fast(env) or "")
     with monkeypatch.context() as patch:
+        patch.setattr(stepper, "_libraries", [])
+        assert "library" in (why_not_fast(env) or "")
+    with monkeypatch.context() as patch:
         patch.setattr(type(env), "_pre_action", lambda *_: None)
         assert "a step of its own" in (why_not_fast(env) or "")
     env.close()

@@ -141,25 +141,42 @@ from pathlib import Path
 def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4 / 1024
 from torchrl_bmrl.envs.sawyer import SawyerEnv
+import torchrl.envs
 stepper, number = sys.argv[1], int(sys.argv[2])
 before, envs = resident(), []
 for _ in range(number):
     envs.append(SawyerEnv("lift", stepper=stepper))
     envs[-1].reset(seed=0)
     envs[-1].step(envs[-1].action_space.sample())
-import torchrl.envs
+print(f"{before:.0f} | {resident():.0f}")
+"""
+WORKER = """
+import sys
+from pathlib import Path
+def resident():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4 / 1024
+from torchrl_bmrl.experts import collect
+from torchrl_bmrl.experts.controllers import ExpertGains
+before = resident()
+for task in ("lift", "push_left"):
+    collect.collect_episode(task, 0, noise=0.2, gains=ExpertGains(), stepper=sys.argv[1])
 print(f"{before:.0f} | {resident():.0f}")
 """
 
 
 def memory_table() -> None:
-    """Resident memory of a process with some environments that have acted, TorchRL included."""
-    print("\n| Stepper | environments | MB of imports | MB in all |\n|---|---:|---:|---:|")
+    """Resident memory of a process with environments that have acted, and of one that collects."""
+    print("\n| Stepper | process | MB of imports | MB in all |\n|---|---|---:|---:|")
     for stepper in STEPPERS:
-        for number in (1, 2, 4):
-            command = [sys.executable, "-c", MEMORY, stepper, str(number)]
+        for name, *arguments in (
+            ("1 environment", MEMORY, stepper, "1"),
+            ("2 environments", MEMORY, stepper, "2"),
+            ("4 environments", MEMORY, stepper, "4"),
+            ("a worker that collects", WORKER, stepper),
+        ):
+            command = [sys.executable, "-c", *arguments]
             done = subprocess.run(command, capture_output=True, text=True, check=True)
-            print(f"| {stepper} | {number} | {done.stdout.strip()} |", flush=True)
+            print(f"| {stepper} | {name} | {done.stdout.strip()} |", flush=True)
 
 
 def main() -> None:

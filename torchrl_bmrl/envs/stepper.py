@@ -33,19 +33,20 @@ if TYPE_CHECKING:
     from torchrl_bmrl.envs.tasks import _BMRLSawyerTask
 
 # The library that mujoco's bindings have loaded; compiled code finds its functions by name.
-_library = next(
+_libraries = [
     path
     for pattern in ("libmujoco.so*", "libmujoco*.dylib", "mujoco.dll")
     for path in Path(mujoco.__file__).parent.glob(pattern)
-)
-binding.load_library_permanently(str(_library))
+]
+for _library in _libraries:
+    binding.load_library_permanently(str(_library))
 _address = types.uintp
 _mj_step1 = types.ExternalFunction("mj_step1", types.void(_address, _address))
 _mj_step2 = types.ExternalFunction("mj_step2", types.void(_address, _address))
 _mj_jac_site = types.ExternalFunction("mj_jacSite", types.void(*[_address] * 4, types.int32))
 _mj_full_m = types.ExternalFunction("mj_fullM", types.void(*[_address] * 3))
 _mj_fwd_position = types.ExternalFunction("mj_fwdPosition", types.void(_address, _address))
-_py_vectorcall = types.ExternalFunction("PyObject_Vectorcall", _address(*[_address] * 4))
+_py_call = types.ExternalFunction("PyObject_Call", _address(*[_address] * 3))
 _py_decref = types.ExternalFunction("Py_DecRef", types.void(_address))
 
 
@@ -54,6 +55,7 @@ class _Robot(NamedTuple):
 
     model: int  # address
     data: int  # address
+    dot: int  # address of np.dot
     site: int  # end-effector
     dof: int  # first of the arm's in qvel
     joint: int  # first of the arm's in qpos
@@ -89,13 +91,13 @@ class _Scratch(NamedTuple):
 
 
 class _Products(NamedTuple):
-    """Calls of ``np.dot(a, b, out)``: addresses of the function and of its three arguments."""
+    """Addresses of the arguments ``(a, b, out)`` of ``np.dot``."""
 
-    velocity: np.ndarray
-    angular_velocity: np.ndarray
-    force: np.ndarray
-    torque: np.ndarray
-    joint_torque: np.ndarray
+    velocity: int
+    angular_velocity: int
+    force: int
+    torque: int
+    joint_torque: int
 
 
 class _Goal(NamedTuple):
@@ -109,9 +111,9 @@ class _Goal(NamedTuple):
 
 
 @numba.njit(cache=True)
-def _numpy_dot(call: np.ndarray) -> None:
+def _numpy_dot(dot: int, arguments: int) -> None:
     # numpy's BLAS is not the one that numba calls, and rounds differently.
-    _py_decref(_py_vectorcall(call[0], call.ctypes.data + 8, 3, 0))
+    _py_decref(_py_call(dot, arguments, 0))
 
 
 @numba.njit(cache=True)
@@ -135,8 +137,8 @@ def _control_period(
             robot.site,
         )
         _mj_full_m(robot.model, scratch.full_mass.ctypes.data, robot.inertia.ctypes.data)
-        _numpy_dot(products.velocity)
-        _numpy_dot(products.angular_velocity)
+        _numpy_dot(robot.dot, products.velocity)
+        _numpy_dot(robot.dot, products.angular_velocity)
         scratch.mass[:] = scratch.full_mass[dofs, dofs]
         scratch.arm_position[:] = scratch.jacobian_position[:, dofs]
         scratch.arm_rotation[:] = scratch.jacobian_rotation[:, dofs]
@@ -155,9 +157,9 @@ def _control_period(
         )
         scratch.lambda_position[:] = lambda_position
         scratch.lambda_rotation[:] = lambda_rotation
-        _numpy_dot(products.force)
-        _numpy_dot(products.torque)
-        _numpy_dot(products.joint_torque)
+        _numpy_dot(robot.dot, products.force)
+        _numpy_dot(robot.dot, products.torque)
+        _numpy_dot(robot.dot, products.joint_torque)
         rest = nullspace_torques(
             scratch.mass, nullspace, goal.rest, robot.qpos[joints], robot.qvel[dofs]
         )
@@ -175,6 +177,8 @@ def why_not_fast(env: _BMRLSawyerTask) -> str | None:
     Args:
         env: robosuite environment, reset.
     """
+    if not _libraries:
+        return "MuJoCo's library is not beside its Python package"
     robot = env.robots[0]
     composite = robot.composite_controller
     arm, gripper = (composite.part_controllers.get(name) for name in ("right", "right_gripper"))
@@ -251,6 +255,7 @@ class FastStepper:
         self._robot = _Robot(
             model=model._address,
             data=data._address,
+            dot=id(np.dot),
             site=site,
             dof=int(self._arm.qvel_index[0]),
             joint=int(self._arm.qpos_index[0]),
@@ -282,20 +287,15 @@ class FastStepper:
             torque=np.zeros(3),
             joint_torque=np.zeros(n),
         )
-        calls = {
+        # Held, like the model and the data.
+        self._arguments = {
             "velocity": (scratch.jacobian_position, data.qvel, scratch.velocity),
             "angular_velocity": (scratch.jacobian_rotation, data.qvel, scratch.angular_velocity),
             "force": (scratch.lambda_position, scratch.force, wrench[:3]),
             "torque": (scratch.lambda_rotation, scratch.torque, wrench[3:]),
             "joint_torque": (scratch.arm_jacobian.T, wrench, scratch.joint_torque),
         }
-        self._calls = calls  # held, like the model and the data
-        self._products = _Products(
-            **{
-                name: np.array([id(np.dot), *map(id, arrays)], dtype=np.uintp)
-                for name, arrays in calls.items()
-            }
-        )
+        self._products = _Products(**{name: id(each) for name, each in self._arguments.items()})
 
     def serves(self, env: _BMRLSawyerTask) -> bool:
         """Whether ``env`` still is as it was: no reset since, the same simulator."""
