@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -52,9 +52,16 @@ def run(
     *,
     seed: int = 3,
     workers: int = 1,
+    stepper: str = "fast",
 ) -> dict[str, Path]:
     return collect_demonstrations(
-        directory, episodes, valid_episodes=1, noise=0.2, seed=seed, workers=workers
+        directory,
+        episodes,
+        valid_episodes=1,
+        noise=0.2,
+        seed=seed,
+        workers=workers,
+        stepper=stepper,
     )
 
 
@@ -116,18 +123,65 @@ def test_a_stored_seed_reproduces_its_episode(collected: dict[str, Path]) -> Non
         np.testing.assert_array_equal(again.rewards, demo["rewards"][:])
 
 
+@pytest.fixture
+def patch_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Code that worker processes run when they start; theirs must be short episodes, too."""
+
+    def patch(code: str = "") -> None:
+        monkeypatch.setenv("PYTHONPATH", str(tmp_path / "patch"), prepend=os.pathsep)
+        (tmp_path / "patch").mkdir()
+        start = f"import torchrl_bmrl.names\ntorchrl_bmrl.names.HORIZON = {HORIZON}\n"
+        (tmp_path / "patch" / "sitecustomize.py").write_text(start + code)
+
+    return patch
+
+
 def test_two_workers_write_the_same_bytes_as_one(
-    tmp_path: Path, collected: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, collected: dict[str, Path], patch_workers: Callable[..., None]
 ) -> None:
-    # Worker processes import the package afresh: there, too, the episodes must be short.
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "patch"), prepend=os.pathsep)
-    (tmp_path / "patch").mkdir()
-    (tmp_path / "patch" / "sitecustomize.py").write_text(
-        f"import torchrl_bmrl.names\ntorchrl_bmrl.names.HORIZON = {HORIZON}\n"
-    )
+    patch_workers()
     again = run(tmp_path / "two", workers=2)
     for task, path in collected.items():
         assert again[task].read_bytes() == path.read_bytes()
+
+
+KILL_THE_FIRST = """
+import os, pathlib, signal
+from torchrl_bmrl.data import robomimic
+keep = robomimic.keep_episode
+def keep_episode(path, episode):
+    try:
+        pathlib.Path({flag!r}).touch(exist_ok=False)
+    except FileExistsError:
+        return keep(path, episode)
+    os.kill(os.getpid(), signal.SIGKILL)
+robomimic.keep_episode = keep_episode
+"""
+
+
+@pytest.mark.slow
+def test_a_worker_killed_in_an_episode_changes_no_byte(
+    tmp_path: Path,
+    collected: dict[str, Path],
+    patch_workers: Callable[..., None],
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    patch_workers(KILL_THE_FIRST.format(flag=str(tmp_path / "killed")))
+    again = run(tmp_path / "two", workers=2)
+    assert (tmp_path / "killed").exists()
+    said = [line for line in capfd.readouterr().err.splitlines() if "done again" in line]
+    assert len(said) == 1
+    assert said[0].startswith("collecting demonstrations: a worker was killed by signal 9")
+    for task, path in collected.items():
+        assert again[task].read_bytes() == path.read_bytes()
+
+
+def test_robosuites_own_steps_write_the_same_bytes(
+    tmp_path: Path, collected: dict[str, Path]
+) -> None:
+    stock = run(tmp_path, stepper="robosuite")
+    for task, path in collected.items():
+        assert stock[task].read_bytes() == path.read_bytes()
 
 
 def test_episodes_do_not_depend_on_how_many_are_asked_for(

@@ -172,6 +172,7 @@ COVERED = {
         "output_max": [0.05] * 3,
         "output_min": [-0.05] * 3,
     },
+    "absolute poses": {"input_type": "absolute"},
     "stiffer": {"kp": [100, 200, 300, 100, 200, 300], "damping_ratio": 0.7},
 }
 NOT_COVERED = {

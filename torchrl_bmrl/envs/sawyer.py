@@ -124,13 +124,13 @@ class SawyerEnv(gymnasium.Env):
             BMRLError: as :meth:`set_state`.
         """
         super().reset(seed=seed)
-        if seed is not None:
-            # In place: assigning robosuite's rng would not reach the samplers that hold it.
-            state = np.random.default_rng(seed).bit_generator.state
-            self.robosuite_env.rng.bit_generator.state = state
         if options and "state" in options:
-            self.set_state(options["state"])
+            self.set_state(options["state"])  # its random numbers come along, whatever the seed
         else:
+            if seed is not None:
+                # In place: assigning robosuite's rng would not reach the samplers that hold it.
+                state = np.random.default_rng(seed).bit_generator.state
+                self.robosuite_env.rng.bit_generator.state = state
             self._steps = 0
             self.robosuite_env.reset()
         return self.robosuite_env.named_observation(), self._info({})
@@ -268,10 +268,7 @@ class SawyerEnv(gymnasium.Env):
 def _rng_to_array(rng: np.random.Generator) -> np.ndarray:
     """State of numpy's default generator (PCG64), uint64 (6,)."""
     state = rng.bit_generator.state
-    low = (1 << 64) - 1
-    words = [
-        (state["state"][name] >> shift) & low for name in ("state", "inc") for shift in (64, 0)
-    ]
+    words = [word for name in ("state", "inc") for word in divmod(state["state"][name], 1 << 64)]
     return np.array([*words, state["has_uint32"], state["uinteger"]], dtype=np.uint64)
 
 
