@@ -106,7 +106,7 @@ BAD = {
     "missing": lambda state: state.pop("gripper"),
     "unknown": lambda state: state.update(colour=np.zeros(3)),
     "shape": lambda state: state.update(physics=state["physics"][:-1]),
-    "kind": lambda state: state.update(steps=np.array([1.0, 1.0])),
+    "kind": lambda state: state.update(steps=np.array([1.0])),
     "nan": lambda state: state.update(rest_joints=np.full(7, np.nan)),
 }
 

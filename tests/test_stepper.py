@@ -24,7 +24,7 @@ from torchrl_bmrl.envs.stepper import FastStepper, why_not_fast
 from torchrl_bmrl.envs.tasks import make_robosuite_env, without_pictures
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.experts.controllers import make_expert
-from torchrl_bmrl.names import HORIZON, TASKS
+from torchrl_bmrl.names import HORIZON, STEPPERS, TASKS
 
 pytestmark = pytest.mark.robosuite
 
@@ -153,14 +153,15 @@ def test_reset_of_the_robosuite_environment_itself_is_noticed(pairs: Any) -> Non
 # -- controllers -----------------------------------------------------------------------------------
 
 
-def controller(**changes: Any) -> dict[str, Any]:
-    """Sawyer's composite controller with another configuration of the arm."""
+def made_with(changes: dict[str, Any]) -> list[SawyerEnv]:
+    """A fast and a stock environment, reset, with another configuration of the arm's controller."""
     config = load_composite_controller_config(robot="Sawyer")
-    gripper = changes.pop("gripper", None)
     config["body_parts"]["right"].update(changes)
-    if gripper:
-        config["body_parts"]["right"]["gripper"].update(gripper)
-    return config
+    envs = [SawyerEnv("lift", stepper=name, controller_configs=config) for name in STEPPERS]
+    for env in envs:
+        env.reset(seed=1)
+        env.action_space.seed(1)
+    return envs
 
 
 COVERED = {
@@ -186,17 +187,12 @@ NOT_COVERED = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COVERED)
 def test_other_operational_space_controllers_are_covered(name: str) -> None:
-    configs = controller(**COVERED[name])
-    envs = [SawyerEnv("lift", stepper=s, controller_configs=configs) for s in sawyer.STEPPERS]
-    fast, reference = envs
-    for env in envs:
-        env.reset(seed=1)
-        env.action_space.seed(1)
+    fast, reference = made_with(COVERED[name])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert_same_steps(reference, fast, fast.action_space.sample, 30)
     assert fast._fast is not None
-    for env in envs:
+    for env in (fast, reference):
         env.close()
 
 
@@ -206,12 +202,7 @@ def test_a_controller_that_is_not_covered_takes_robosuites_step_and_says_so_once
     reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sawyer, "_said", set())
-    configs = controller(**NOT_COVERED[reason])
-    envs = [SawyerEnv("lift", stepper=s, controller_configs=configs) for s in sawyer.STEPPERS]
-    fast, reference = envs
-    for env in envs:
-        env.reset(seed=1)
-        env.action_space.seed(1)
+    fast, reference = made_with(NOT_COVERED[reason])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         assert_same_steps(reference, fast, fast.action_space.sample, 5)
@@ -221,7 +212,7 @@ def test_a_controller_that_is_not_covered_takes_robosuites_step_and_says_so_once
     assert "robosuite's own, and slow" in str(caught[0].message)
     with pytest.raises(BMRLError, match=reason):
         FastStepper(fast.robosuite_env)
-    for env in envs:
+    for env in (fast, reference):
         env.close()
 
 

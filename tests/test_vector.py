@@ -83,6 +83,12 @@ def test_bad_calls_of_a_vector_environment_are_answered() -> None:
     for actions in (bad, np.zeros(7)):
         with pytest.raises(BMRLError, match=r"finite, \(2, 7\)"):
             vector.step(actions)
+    broken = vector.get_states()
+    del broken[1]["gripper"]
+    vector.step(np.zeros((2, 7)))
+    before = vector.get_states()
+    with pytest.raises(BMRLError, match="gripper"):
+        vector.reset(options={"states": broken})
     for state, then in zip(vector.get_states(), before, strict=True):
         np.testing.assert_array_equal(state["physics"], then["physics"])
     vector.close()

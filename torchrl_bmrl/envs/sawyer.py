@@ -16,7 +16,7 @@ from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.names import STEPPERS
 
 with user_numba_cache():
-    from torchrl_bmrl.envs.stepper import FastStepper, why_not_fast
+    from torchrl_bmrl.envs.stepper import FastStepper
 
 _PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION
 _said: set[str] = set()
@@ -86,7 +86,6 @@ class SawyerEnv(gymnasium.Env):
         self.image_size = image_size
         self.stepper = stepper
         self.horizon = horizon
-        self._steps = 0
         self._fast: FastStepper | None = None
         self._picture: tuple[mujoco.MjModel, mujoco.MjData, mujoco.Renderer] | None = None
         options = {} if controller_configs is None else {"controller_configs": controller_configs}
@@ -131,7 +130,6 @@ class SawyerEnv(gymnasium.Env):
                 # In place: assigning robosuite's rng would not reach the samplers that hold it.
                 state = np.random.default_rng(seed).bit_generator.state
                 self.robosuite_env.rng.bit_generator.state = state
-            self._steps = 0
             self.robosuite_env.reset()
         return self.robosuite_env.named_observation(), self._info({})
 
@@ -148,21 +146,21 @@ class SawyerEnv(gymnasium.Env):
         if action.shape != shape or not np.isfinite(action).all():
             raise BMRLError(f"action is {action}; valid: finite, of shape {shape}")
         self._advance(action)
-        self._steps += 1
         terms = self.robosuite_env.reward_terms()
         observation = self.robosuite_env.named_observation()
-        truncated = self.horizon is not None and self._steps >= self.horizon
+        truncated = self.horizon is not None and self.robosuite_env.timestep >= self.horizon
         return observation, sum(terms.values()), False, truncated, self._info(terms)
 
     def _advance(self, action: np.ndarray) -> None:
         env = self.robosuite_env
         if self.stepper == "fast" and (self._fast is None or not self._fast.serves(env)):
             self._fast = None
-            if (reason := why_not_fast(env)) is None:
+            try:
                 self._fast = FastStepper(env)
-            elif reason not in _said:
-                _said.add(reason)
-                warnings.warn(f"steps are robosuite's own, and slow: {reason}", stacklevel=3)
+            except BMRLError as error:
+                if str(error) not in _said:
+                    _said.add(str(error))
+                    warnings.warn(f"steps are robosuite's own, and slow: {error}", stacklevel=3)
         if self._fast is None:
             env.step(action)
             return
@@ -191,7 +189,7 @@ class SawyerEnv(gymnasium.Env):
             "gripper": np.array(robot.gripper["right"].current_action, dtype=np.float64),
             "rest_joints": np.array(arm.initial_joint, dtype=np.float64),
             "goal_start": env.goal_start,
-            "steps": np.array([self._steps, env.timestep]),
+            "steps": np.array([env.timestep]),
             "rng": _rng_to_array(env.rng),
         }
 
@@ -233,7 +231,7 @@ class SawyerEnv(gymnasium.Env):
         # Otherwise robosuite goes on from the pose that it saw last.
         arm.new_update = True
         env.goal_start = state["goal_start"]
-        self._steps, env.timestep = (int(count) for count in state["steps"])
+        env.timestep = int(state["steps"][0])
         env.cur_time = env.timestep * env.control_timestep
 
     # -- pictures ------------------------------------------------------------------------------

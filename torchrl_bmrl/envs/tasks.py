@@ -88,8 +88,8 @@ def push_velocity_reward(velocity: np.ndarray, direction: np.ndarray) -> float:
 def without_pictures(xml: str) -> str:
     """The same physics without what only a camera sees: geoms that touch nothing, their meshes.
 
-    Trajectories stay the same to the bit; a model takes 0.1 MB and not 80, a step three quarters of
-    the time.
+    Trajectories stay the same to the bit; a model takes 0.1 MB and not 80, its physics three
+    quarters of the time.
 
     Args:
         xml: MJCF whose bodies have explicit inertias, as robosuite's robots do.

@@ -14,7 +14,7 @@ from torchrl_bmrl.errors import BMRLError
 
 
 class SawyerVectorEnv(VectorEnv):
-    """``num_envs`` episodes of one Sawyer task; an episode costs its state, 1 kB.
+    """``num_envs`` episodes of one Sawyer task; an episode costs its state, 3 kB.
 
     One :class:`~torchrl_bmrl.envs.sawyer.SawyerEnv` plays them in turn, each from the state that it
     had: a policy acts in all of them with one call, and memory stays that of one environment. Each
@@ -69,7 +69,8 @@ class SawyerVectorEnv(VectorEnv):
                 ``{"states": states}`` goes on from states of :meth:`get_states`.
 
         Raises:
-            BMRLError: if there are more or fewer seeds or states than environments.
+            BMRLError: if there are more or fewer seeds or states than environments, or a state is
+                not one; every episode is then as it was.
         """
         options = options or {}
         if seed is None or isinstance(seed, int | np.integer):
@@ -79,14 +80,16 @@ class SawyerVectorEnv(VectorEnv):
         for name, rows in (("seeds", seed), ("states", states), ("entries of reset_mask", mask)):
             if len(rows) != self.num_envs:
                 raise BMRLError(
-                    f"{len(rows)} {name} for {self.num_envs} environments; valid: each one"
+                    f"{len(rows)} {name} for {self.num_envs} environments; valid: one for each"
                 )
+        if any(now is None for now, starts in zip(self._states, mask, strict=True) if not starts):
+            raise BMRLError("reset_mask leaves out episodes that never started")
+        shown, started = list(self._shown), list(self._states)
         for i in np.flatnonzero(mask):
             wanted = None if states[i] is None else {"state": states[i]}
-            self._shown[i] = self._env.reset(seed=seed[i], options=wanted)
-            self._states[i] = self._env.get_state()
-        if None in self._states:
-            raise BMRLError("reset_mask leaves out episodes that never started")
+            shown[i] = self._env.reset(seed=seed[i], options=wanted)
+            started[i] = self._env.get_state()
+        self._shown, self._states = shown, started  # all, or none if a state is refused
         observations, infos = zip(*self._shown, strict=True)
         return _stack(observations), _stack(infos)
 
