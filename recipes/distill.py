@@ -10,6 +10,8 @@ import os
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
+import math
+from copy import deepcopy
 from pathlib import Path
 
 import hydra
@@ -28,6 +30,14 @@ from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.objectives import BCQLoss, MetaDistillationLoss
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
 from torchrl_bmrl.runs import check_finite, log_metrics, make_logger
+from torchrl_bmrl.training import (
+    accelerate,
+    get_rng_state,
+    gradient_step,
+    load_adam,
+    make_adam,
+    set_rng_state,
+)
 
 LOSS_SETTINGS = (
     "context",
@@ -75,7 +85,9 @@ def train_student(config: Config, report: Report) -> None:
     )
     if settings.context == "previous":
         train = [with_previous(data, TRANSITION_KEYS) for data in train]
-    buffer = make_multi_task_replay_buffer(train, batch_size=settings.batch_size)
+    buffer = make_multi_task_replay_buffer(
+        train, batch_size=settings.batch_size, device=config.device
+    )
 
     torch.manual_seed(derive_seed(config.seed, "distill"))
     losses = load_teachers(config)
@@ -100,40 +112,44 @@ def train_student(config: Config, report: Report) -> None:
         qvalue_loc=normalisation[0],
         qvalue_scale=normalisation[1],
         **{name: getattr(settings, name) for name in LOSS_SETTINGS},
-    )
-    optimizer = torch.optim.Adam(loss.parameters(), lr=settings.lr)
-    decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.updates)
+    ).to(config.device)
+    optimizer = make_adam(loss.parameters(), lr=settings.lr)
     done = 0
     if path.exists():
         state, metadata = load_checkpoint(path, kind="student")
         load_state(student, state["student"], path)
-        optimizer.load_state_dict(state["optimizer"])
-        decay.load_state_dict(state["decay"])
-        torch.set_rng_state(state["rng"])
+        load_adam(optimizer, state["optimizer"])
+        set_rng_state(state["rng"], config.device)
         done = metadata["updates"]
         report(done)
     logger = make_logger(config.logger, run_dir, "distill") if done < settings.updates else None
 
-    for update in range(done + 1, settings.updates + 1):
-        losses = loss(buffer.sample())
+    def step(batch: TensorDictBase) -> dict[str, Tensor]:
+        losses = loss(batch)
         total = sum(term for name, term in losses.items() if name.startswith("loss_"))
-        optimizer.zero_grad(set_to_none=True)
-        total.backward()
-        optimizer.step()
-        if settings.cosine:
-            decay.step()
+        gradient_step(optimizer, total)
+        return {name: value.detach() for name, value in losses.items()}
+
+    step = accelerate(
+        step, compiled=config.compile, captured=config.cudagraphs, device=config.device
+    )
+    for update in range(done + 1, settings.updates + 1):
+        if settings.cosine:  # from lr to zero
+            share = (update - 1) / settings.updates
+            rate = settings.lr * (1 + math.cos(math.pi * share)) / 2
+            optimizer.param_groups[0]["lr"].fill_(rate)
+        metrics = step(buffer.sample().select(*loss.in_keys))
         report(1)
         if update % config.log_interval == 0:
-            metrics = losses.detach()
             check_finite(metrics, f"distillation, update {update}")
             log_metrics(logger, metrics, update)
         if update % config.checkpoint_interval == 0 or update == settings.updates:
-            student.set_prototypes(train, settings.prototype)
+            kept = student if config.device == "cpu" else deepcopy(student).to("cpu")
+            kept.set_prototypes(train, settings.prototype)
             state = {
-                "student": student.state_dict(),
+                "student": kept.state_dict(),
                 "optimizer": optimizer.state_dict(),
-                "decay": decay.state_dict(),
-                "rng": torch.get_rng_state(),
+                "rng": get_rng_state(config.device),
             }
             metadata = {
                 "kind": "student",
@@ -141,7 +157,7 @@ def train_student(config: Config, report: Report) -> None:
                 "student": options,
                 "latent_clip": teachers[0].latent_clip,
                 "updates": update,
-                "accuracy": student.accuracy(torch.cat(valid)),
+                "accuracy": kept.accuracy(torch.cat(valid)),
                 "statistics": {name: x.tolist() for name, x in vars(statistics).items()},
             }
             save_checkpoint(path, state, metadata)

@@ -24,7 +24,7 @@ import numpy as np
 from collect import collect
 from omegaconf import DictConfig
 from settings import Config, run_recipe
-from train_bcq import train_agent
+from train_bcq import train_agents
 
 from torchrl_bmrl.agents import load_bcq_loss
 from torchrl_bmrl.data import make_mixed_replay_buffer
@@ -59,8 +59,9 @@ def train_job(job: Job, report: Report) -> None:
         [scripted, human.select(*scripted.keys(True, True))],
         weights=[1 - share, share],
         batch_size=config.bcq.batch_size,
+        device=config.device,
     )
-    train_agent(config, TASK, agent_name(share, seed), buffer, statistics, report)
+    train_agents(config, {agent_name(share, seed): TASK}, buffer, statistics, report)
 
 
 def evaluate_job(job: Job, report: Report) -> list[dict]:

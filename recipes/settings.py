@@ -14,6 +14,7 @@ from torchrl_bmrl.agents import LATENT_SOURCES
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.experts.controllers import ExpertGains
 from torchrl_bmrl.names import STEPPERS, TASKS, check_task
+from torchrl_bmrl.objectives.bcq import TARGET_DTYPES
 from torchrl_bmrl.objectives.checks import check_value_bounds
 from torchrl_bmrl.objectives.common import LOSS_FUNCTIONS
 from torchrl_bmrl.objectives.distillation import CONTEXTS, ENCODER_TERMS
@@ -56,6 +57,9 @@ class BCQSettings:
     loss_function: str = "l2"  # or l1, smooth_l1 (Huber)
     generator_warmup: int = 0  # updates of the generator alone before the critics start
     critic_grad_clip: float | None = None  # norm of the critics' gradient
+    target_dtype: str | None = None  # bfloat16 proposes and values next actions in that type
+    seeds: int = 1  # agents of each task; those after the first are kept under bcq/<task>-<seed>
+    stacked: bool = False  # all agents as one program, for a GPU; False: a process each
 
 
 @dataclass
@@ -112,6 +116,9 @@ class Config:
     tasks: list[str] = field(default_factory=lambda: list(TASKS))
     workers: int = field(default_factory=available_cores)  # processes; no result depends on them
     stepper: str = "fast"  # or robosuite, four times slower; no result depends on it
+    device: str = "cpu"  # that trains; episodes are played on the CPU
+    compile: bool = False  # the updates, with torch.compile: half a minute, then faster
+    cudagraphs: bool = False  # captures the updates, on a GPU
     logger: str = "csv"  # csv, wandb, tensorboard, none
     log_interval: int = 100  # updates
     checkpoint_interval: int = 1000  # updates
@@ -133,6 +140,7 @@ POSITIVE = (
     "bcq.lr",
     "bcq.num_qvalue_nets",
     "bcq.num_candidates",
+    "bcq.seeds",
     "distill.updates",
     "distill.batch_size",
     "distill.lr",
@@ -148,6 +156,7 @@ CHOICES = {
     "stepper": STEPPERS,
     "bcq.loss_function": LOSS_FUNCTIONS,
     "bcq.kl_reduction": KL_REDUCTIONS,
+    "bcq.target_dtype": (None, *TARGET_DTYPES),
     "distill.context": CONTEXTS,
     "distill.prototype": ("mean", "medoid"),
 }

@@ -370,13 +370,13 @@ def test_stage_1_resumed_equals_never_stopped(
     config = OmegaConf.to_object(configured(*SMALL, f"run_dir={tmp_path}"))
     checkpoint = tmp_path / "bcq" / "lift" / "checkpoint.safetensors"
     with pytest.raises(error):
-        train_bcq.train_task((config, "lift"), Interruption(update, error))
+        train_bcq.train_job((config, {"lift": "lift"}), Interruption(update, error))
     if kept is None:
         assert not checkpoint.exists()
     else:
         assert load_checkpoint(checkpoint, kind="bcq")[1]["updates"] == kept
     counted: list[int] = []
-    train_bcq.train_task((config, "lift"), counted.append)
+    train_bcq.train_job((config, {"lift": "lift"}), counted.append)
     # What the checkpoint holds is reported at once and not trained again.
     assert counted == ([kept] if kept else []) + [1] * (12 - (kept or 0))
     expected = contents(finished, "bcq/lift/*")
@@ -396,7 +396,7 @@ def trained(
 
     shutil.copytree(finished / "data", folder / "data")
     config = OmegaConf.to_object(configured(*SMALL, f"run_dir={folder}", *overrides))
-    train_bcq.train_task((config, "lift"), lambda count: None)
+    train_bcq.train_job((config, {"lift": "lift"}), lambda count: None)
     path = folder / "bcq" / "lift" / "checkpoint.safetensors"
     state, metadata = load_checkpoint(path, kind="bcq")
     torch.manual_seed(derive_seed(config.seed, "bcq", "lift"))
@@ -577,7 +577,7 @@ def test_learning_from_people_compares_every_share_and_goes_on(
 
     # What the agents trained on: ten scripted transitions, then the human ones.
     buffers: list[Any] = []
-    monkeypatch.setattr(learn_from_people, "train_agent", lambda *given: buffers.append(given[3]))
+    monkeypatch.setattr(learn_from_people, "train_agents", lambda *given: buffers.append(given[3]))
     config = OmegaConf.to_object(configured(*SMALL, f"run_dir={tmp_path}"))
     for share in (0.0, 1.0):
         learn_from_people.train_job((config, share, 0), lambda _: None)

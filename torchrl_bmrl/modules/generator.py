@@ -3,13 +3,83 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torch.nn.functional import linear
 from torchrl.modules import MLP
+
+
+class CandidateMLP(MLP):
+    """TorchRL's MLP, which of an input that is the same for all candidates takes one.
+
+    Such an input is expanded along the dimension before the last one (its stride there is 0), as a
+    state is over the actions proposed for it: its part of the first layer is computed once and
+    added to each candidate's own.
+
+    Example:
+        >>> network = CandidateMLP(3, 2, num_cells=[8])
+        >>> state, actions = torch.randn(5, 1, 1).expand(5, 10, 1), torch.randn(5, 10, 2)
+        >>> whole = network(state.contiguous(), actions)
+        >>> torch.allclose(network(state, actions), whole, atol=1e-6)
+        True
+    """
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Output for the inputs, concatenated along the last dimension."""
+        alike = [x.ndim > 1 and x.shape[-2] > 1 and x.stride(-2) == 0 for x in inputs]
+        if not any(alike) or all(alike):
+            return super().forward(*inputs)
+        first, *rest = self
+        weights = first.weight.split([x.shape[-1] for x in inputs], -1)
+        parts = list(zip(inputs, weights, alike, strict=True))
+        once = linear(
+            torch.cat([x[..., :1, :] for x, _, same in parts if same], -1),
+            torch.cat([w for _, w, same in parts if same], -1),
+            first.bias,
+        )
+        hidden = linear(
+            torch.cat([x for x, _, same in parts if not same], -1),
+            torch.cat([w for _, w, same in parts if not same], -1),
+        )
+        hidden = hidden + once
+        for layer in rest:
+            hidden = layer(hidden)
+        return hidden
+
+
+class Network(TensorDictModule):
+    """TensorDictModule whose tensors are written as they are.
+
+    tensordict 0.14 looks on the disk for pandas at each output that it writes, a tenth of a small
+    update.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> network = Network(nn.Linear(2, 1), in_keys=["x"], out_keys=["y"])
+        >>> network(TensorDict({"x": torch.zeros(5, 2)}, [5]))["y"].shape
+        torch.Size([5, 1])
+    """
+
+    def _write_to_tensordict(
+        self,
+        tensordict: TensorDictBase,
+        tensors: Any,
+        tensordict_out: Any = None,
+        out_keys: Any = None,
+    ) -> TensorDictBase:
+        keys = self.out_keys_source if out_keys is None else out_keys
+        simple = tensordict_out is None and self.inplace is True and len(tensors) == len(keys)
+        if not simple or not all(isinstance(value, Tensor) for value in tensors):
+            return super()._write_to_tensordict(tensordict, tensors, tensordict_out, out_keys)
+        for key, value in zip(keys, tensors, strict=True):
+            if key != "_":
+                tensordict.set(key, value)
+        return tensordict
 
 
 def make_mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> MLP:
@@ -19,7 +89,7 @@ def make_mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> M
         >>> make_mlp(3, 2, (8,))(torch.zeros(5, 1), torch.zeros(5, 2)).shape
         torch.Size([5, 2])
     """
-    return MLP(
+    return CandidateMLP(
         in_features,
         out_features,
         num_cells=list(num_cells),
@@ -105,7 +175,7 @@ class ActionVAE(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.latent_dim = 2 * action_dim if latent_dim is None else latent_dim
-        self.encoder = TensorDictModule(
+        self.encoder = Network(
             _Posterior(observation_dim + action_dim, self.latent_dim, num_cells),
             in_keys=[observation_key, "action"],
             out_keys=["action_latent_loc", "action_latent_scale"],
@@ -152,7 +222,7 @@ def make_decoder(
     network = _BoundedDecoder(
         observation_dim + latent_dim + task_latent_dim, action_dim, num_cells, bounds
     )
-    return TensorDictModule(network, in_keys=list(in_keys), out_keys=["action"])
+    return Network(network, in_keys=list(in_keys), out_keys=["action"])
 
 
 def make_qvalue_network(
@@ -172,7 +242,7 @@ def make_qvalue_network(
     """
     in_keys = ["observation", "action", *(["task_latent"] if task_latent_dim else [])]
     network = make_mlp(observation_dim + action_dim + task_latent_dim, 1, num_cells)
-    return TensorDictModule(network, in_keys=in_keys, out_keys=["state_action_value"])
+    return Network(network, in_keys=in_keys, out_keys=["state_action_value"])
 
 
 class _Tanh(nn.Module):
@@ -195,7 +265,7 @@ def make_perturbation_network(
         ['perturbation']
     """
     network = _Tanh(make_mlp(observation_dim + action_dim, action_dim, num_cells))
-    return TensorDictModule(network, in_keys=["observation", "action"], out_keys=["perturbation"])
+    return Network(network, in_keys=["observation", "action"], out_keys=["perturbation"])
 
 
 def make_latent_actor(
@@ -215,4 +285,4 @@ def make_latent_actor(
         ['action_latent']
     """
     network = _Tanh(make_mlp(observation_dim, latent_dim, num_cells), max_latent)
-    return TensorDictModule(network, in_keys=["observation"], out_keys=["action_latent"])
+    return Network(network, in_keys=["observation"], out_keys=["action_latent"])

@@ -17,7 +17,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.modules.generator import make_mlp
+from torchrl_bmrl.modules.generator import Network, make_mlp
 
 TRANSITION_KEYS = ("observation", "action", ("next", "reward"), ("next", "observation"))
 """What the task encoder reads, in this order."""
@@ -42,7 +42,7 @@ def make_task_encoder(
         ['task_latent']
     """
     network = make_mlp(2 * observation_dim + action_dim + 1, task_latent_dim, num_cells)
-    return TensorDictModule(network, in_keys=list(TRANSITION_KEYS), out_keys=["task_latent"])
+    return Network(network, in_keys=list(TRANSITION_KEYS), out_keys=["task_latent"])
 
 
 def make_task_classifier(num_tasks: int, task_latent_dim: int = 2) -> TensorDictModule:
@@ -52,7 +52,7 @@ def make_task_classifier(num_tasks: int, task_latent_dim: int = 2) -> TensorDict
         >>> make_task_classifier(6).out_keys
         ['task_logits']
     """
-    return TensorDictModule(
+    return Network(
         torch.nn.Linear(task_latent_dim, num_tasks),
         in_keys=["task_latent"],
         out_keys=["task_logits"],

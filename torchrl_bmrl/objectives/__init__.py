@@ -7,6 +7,7 @@ from torchrl_bmrl.objectives.discrete_bcq import DiscreteBCQLoss
 from torchrl_bmrl.objectives.distillation import MetaDistillationLoss
 from torchrl_bmrl.objectives.generative import GenerativeLoss
 from torchrl_bmrl.objectives.plas import PLASLoss
+from torchrl_bmrl.objectives.stacked import StackedLoss
 
 __all__ = [
     "BCQLoss",
@@ -16,4 +17,5 @@ __all__ = [
     "MetaDistillationLoss",
     "OfflineLoss",
     "PLASLoss",
+    "StackedLoss",
 ]

@@ -6,7 +6,7 @@ from math import inf, isfinite
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, is_batchedtensor
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -114,11 +114,18 @@ def check_index(key: NestedKey, index: Tensor, count: int) -> None:
     """
     if index.is_floating_point() or index.is_complex() or index.dtype == torch.bool:
         raise BMRLError(f"{key!r} is {index.dtype}; valid: torch.int64")
-    if torch.compiler.is_compiling() or index.device.type != "cpu" or not index.numel():
+    if not readable(index) or not index.numel():
         return
     low, high = int(index.min()), int(index.max())
     if low < 0 or high >= count:
         raise BMRLError(f"{key!r} holds {low if low < 0 else high}; valid: 0 to {count - 1}")
+
+
+def readable(value: Tensor) -> bool:
+    """Whether Python may look at the numbers: on CPU, neither compiled nor under vmap."""
+    return not (
+        torch.compiler.is_compiling() or value.device.type != "cpu" or is_batchedtensor(value)
+    )
 
 
 def next_key(key: NestedKey) -> tuple[str, ...]:
@@ -148,7 +155,7 @@ def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
     value = tensordict.get(key, None)
     if value is None:
         raise missing(tensordict, key)
-    if torch.compiler.is_compiling() or value.device.type != "cpu":
+    if not readable(value):
         return value
     # The sum is cheap and tells all but what only adds up to infinity.
     if value.is_floating_point() and not isfinite(value.sum().item()):

@@ -1,0 +1,234 @@
+"""Updates as one piece that runs eagerly, compiled, or as a captured CUDA graph."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.optim import Adam
+from torch.optim.adam import adam
+
+Metrics = dict[str, Tensor]
+Update = Callable[[TensorDictBase], Metrics]
+
+WARM_UP = 3
+"""Eager updates before a capture: kernels are chosen and memory is taken in them."""
+
+
+def make_adam(params: Iterable[Tensor], lr: float) -> Adam:
+    """Adam for :func:`gradient_step`: one fused kernel, its step and learning rate on the device.
+
+    A scheduler changes the learning rate in place, which neither a compiled nor a captured update
+    takes for another program.
+
+    Example:
+        >>> optimizer = make_adam(torch.nn.Linear(2, 1).parameters(), lr=1e-3)
+        >>> optimizer.param_groups[0]["lr"]
+        tensor(0.0010)
+    """
+    params = list(params)
+    rate = torch.tensor(lr, device=params[0].device)
+    optimizer = Adam(params, lr=rate, fused=True)
+    for param in params:
+        optimizer.state[param] = {
+            "step": torch.zeros((), device=param.device),
+            "exp_avg": torch.zeros_like(param),
+            "exp_avg_sq": torch.zeros_like(param),
+        }
+    return optimizer
+
+
+def load_adam(optimizer: Adam, state: dict[str, Any]) -> None:
+    """Takes over what ``state_dict()`` gave, onto the optimizer's own device."""
+    optimizer.load_state_dict(state)
+    for group in optimizer.param_groups:
+        group["lr"] = group["lr"].to(group["params"][0].device)
+
+
+def get_rng_state(device: str = "cpu") -> dict[str, Tensor]:
+    """State of PyTorch's random numbers, on the CPU and on a GPU that is the device."""
+    state = {"cpu": torch.get_rng_state()}
+    if torch.device(device).type == "cuda":
+        state["cuda"] = torch.cuda.get_rng_state(device)
+    return state
+
+
+def set_rng_state(state: dict[str, Tensor], device: str = "cpu") -> None:
+    """Takes over what :func:`get_rng_state` gave."""
+    torch.set_rng_state(state["cpu"])
+    if "cuda" in state:
+        torch.cuda.set_rng_state(state["cuda"], device)
+
+
+def gradient_step(optimizer: Adam, loss: Tensor, max_norm: float | None = None) -> None:
+    """Does what ``loss.sum().backward()`` and ``optimizer.step()`` do, in one compiled program.
+
+    Compiled, those two are programs of their own with what surrounds them in Python between.
+
+    Args:
+        optimizer: of :func:`make_adam`; other options of Adam than its defaults are not read.
+        loss: ``()``, or of a :class:`~torchrl_bmrl.objectives.StackedLoss` ``[N]``.
+        max_norm: bound on the norm of the gradient, of each member for itself.
+
+    Example:
+        >>> weight = torch.nn.Parameter(torch.ones(1))
+        >>> gradient_step(make_adam([weight], lr=0.1), weight.square())
+        >>> weight.data
+        tensor([0.9000])
+    """
+    (group,) = optimizer.param_groups
+    params = group["params"]
+    grads = torch.autograd.grad(loss.sum(), params, materialize_grads=True)
+    # The fused kernel goes through memory as the parameter lies; vmap's gradients lie otherwise.
+    grads = [grad.contiguous() for grad in grads]
+    state = [optimizer.state[param] for param in params]
+    beta1, beta2 = group["betas"]
+    compiling = torch.compiler.is_compiling()
+    with torch.no_grad():
+        if max_norm is not None:
+            grads = _clipped(grads, max_norm, loss.ndim)
+        adam(
+            params,
+            grads,
+            [each["exp_avg"] for each in state],
+            [each["exp_avg_sq"] for each in state],
+            [],
+            [each["step"] for each in state],
+            # The compiler takes the fused kernel for a black box and the other apart.
+            fused=not compiling,
+            foreach=compiling,
+            capturable=compiling,
+            amsgrad=False,
+            beta1=beta1,
+            beta2=beta2,
+            lr=group["lr"],
+            weight_decay=0.0,
+            eps=group["eps"],
+            maximize=False,
+        )
+
+
+def _clipped(grads: list[Tensor], max_norm: float, members: int) -> list[Tensor]:
+    """As ``clip_grad_norm_``, over each member's gradients."""
+    squares = [grad.square().flatten(members).sum(-1) for grad in grads]
+    norm = torch.stack(squares).sum(0).sqrt()
+    scale = (max_norm / (norm + 1e-6)).clamp(max=1.0)
+    return [grad * scale.view(*scale.shape, *[1] * (grad.ndim - members)) for grad in grads]
+
+
+def accelerate(
+    update: Update, *, compiled: bool = False, captured: bool = False, device: str = "cpu"
+) -> Update:
+    """An update that is compiled, or captured as a CUDA graph, or both.
+
+    Where that fails, at the first call or for want of a GPU, one message says why and the update
+    runs as it is. The first call takes the time of the compilation, about half a minute.
+
+    Compiling sets two of PyTorch's options for the whole process: gradients are traced into the
+    program, and random numbers are drawn as eager code draws them, so that the results are equal.
+
+    Args:
+        update: takes a batch, changes parameters in place and returns metrics. It must not look at
+            numbers (``item()``), and when captured its batches must all have one shape.
+        compiled: whether to use :func:`torch.compile`.
+        captured: whether to record what it does on the GPU after some eager updates, and then
+            replay that. The metrics of a replay lie where those of the one before it lay.
+        device: that the update runs on.
+
+    Example:
+        >>> weight = torch.nn.Parameter(torch.ones(1))
+        >>> optimizer = make_adam([weight], lr=0.1)
+        >>> def update(batch):
+        ...     loss = (weight * batch["x"]).square().sum()
+        ...     gradient_step(optimizer, loss)
+        ...     return {"loss": loss.detach()}
+        >>> from tensordict import TensorDict
+        >>> update = accelerate(update, captured=True)  # no GPU: says so and goes on
+        >>> update(TensorDict({"x": torch.ones(1)}, []))["loss"]
+        tensor(1.)
+    """
+    on_gpu = torch.device(device).type == "cuda"
+    if captured and not on_gpu:
+        _say(f"device={device} has no CUDA graphs; the updates run without")
+        captured = False
+    if not compiled and not captured:
+        return update
+    fast = update
+    if compiled:
+        _prepare_compiler(on_gpu)
+        fast = torch.compile(update, fullgraph=True)
+    return _WithFallback(_Captured(fast) if captured else fast, update)
+
+
+def _prepare_compiler(on_gpu: bool) -> None:
+    import torch._dynamo
+    import torch._inductor.config
+
+    torch._dynamo.config.trace_autograd_ops = True
+    torch._inductor.config.fallback_random = not on_gpu
+
+
+def _say(message: str) -> None:
+    print(message, file=sys.stderr, flush=True)
+
+
+class _WithFallback:
+    """Runs the fast version; if its first calls fail, the plain one from then on."""
+
+    def __init__(self, fast: Update, plain: Update) -> None:
+        self.fast, self.plain, self.left = fast, plain, WARM_UP + 1
+
+    def __call__(self, batch: TensorDictBase) -> Metrics:
+        if not self.left:
+            return self.fast(batch)
+        self.left -= 1
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # what compilers say about tensordict's internals
+                return self.fast(batch)
+        except Exception as error:
+            # Nothing has moved: a program that cannot be made does not run in part.
+            reason = str(error).strip().partition("\n")[0]
+            _say(f"updates are not accelerated ({type(error).__name__}: {reason}); they run as is")
+            self.fast, self.left = self.plain, 0
+            return self.plain(batch)
+
+
+class _Captured:
+    """A CUDA graph of an update.
+
+    tensordict's CudaGraphModule waits for the device before every replay; this does not.
+    """
+
+    def __init__(self, update: Update) -> None:
+        self.update = update
+        self.calls = 0
+        self.graph: torch.cuda.CUDAGraph | None = None
+        self.batch: TensorDictBase
+        self.metrics: Metrics
+
+    def __call__(self, batch: TensorDictBase) -> Metrics:
+        if self.graph is not None:
+            self.batch.copy_(batch, non_blocking=True)
+            self.graph.replay()
+            return self.metrics
+        self.calls += 1
+        if self.calls <= WARM_UP:
+            stream = torch.cuda.Stream()
+            stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(stream):
+                metrics = self.update(batch)
+            torch.cuda.current_stream().wait_stream(stream)
+            return metrics
+        self.batch = batch.clone()
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            self.metrics = self.update(self.batch)
+        self.graph = graph
+        graph.replay()  # recording did not execute it
+        return self.metrics
