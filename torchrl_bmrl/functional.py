@@ -196,7 +196,8 @@ def triplet_error(anchor: Tensor, positive: Tensor, negative: Tensor, margin: fl
         >>> triplet_error(a, near, far, 1.0), triplet_error(a, far, near, 1.0)
         (tensor(0.), tensor(3.))
     """
-    return F.triplet_margin_loss(anchor, positive, negative, margin=margin, reduction="none")
+    near, far = F.pairwise_distance(anchor, positive), F.pairwise_distance(anchor, negative)
+    return (near - far + margin).clamp(min=0.0)
 
 
 def direction_error(prediction: Tensor, target: Tensor) -> Tensor:

@@ -129,8 +129,9 @@ def accelerate(
     Where that fails, at the first call or for want of a GPU, one message says why and the update
     runs as it is. The first call takes the time of the compilation, about half a minute.
 
-    Compiling sets two of PyTorch's options for the whole process: gradients are traced into the
-    program, and random numbers are drawn as eager code draws them, so that the results are equal.
+    Compiling sets options for the whole process: gradients are traced into the program, random
+    numbers are on CPU drawn as eager code draws them, so that the results are equal, and
+    tensordicts are no pytrees any more (as ``tensordict.nn.CudaGraphModule`` has it).
 
     Args:
         update: takes a batch, changes parameters in place and returns metrics. It must not look at
@@ -168,9 +169,12 @@ def accelerate(
 def _prepare_compiler(on_gpu: bool) -> None:
     import torch._dynamo
     import torch._inductor.config
+    from tensordict.nn.functional_modules import _exclude_td_from_pytree
 
     torch._dynamo.config.trace_autograd_ops = True
     torch._inductor.config.fallback_random = not on_gpu
+    # vmap over tensordicts does this at every call, and each would be compiled anew.
+    _exclude_td_from_pytree().set()
 
 
 def _say(message: str) -> None:

@@ -31,25 +31,33 @@ class CandidateMLP(MLP):
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Output for the inputs, concatenated along the last dimension."""
-        alike = [x.ndim > 1 and x.shape[-2] > 1 and x.stride(-2) == 0 for x in inputs]
-        if not any(alike) or all(alike):
-            return super().forward(*inputs)
         first, *rest = self
-        weights = first.weight.split([x.shape[-1] for x in inputs], -1)
-        parts = list(zip(inputs, weights, alike, strict=True))
-        once = linear(
-            torch.cat([x[..., :1, :] for x, _, same in parts if same], -1),
-            torch.cat([w for _, w, same in parts if same], -1),
-            first.bias,
-        )
-        hidden = linear(
-            torch.cat([x for x, _, same in parts if not same], -1),
-            torch.cat([w for _, w, same in parts if not same], -1),
-        )
-        hidden = hidden + once
+        alike = [x.ndim > 1 and x.shape[-2] > 1 and x.stride(-2) == 0 for x in inputs]
+        if any(alike) and not all(alike):
+            weights = first.weight.split([x.shape[-1] for x in inputs], -1)
+            parts = list(zip(inputs, weights, alike, strict=True))
+            once = [(x[..., :1, :], weight) for x, weight, same in parts if same]
+            each = [(x, weight) for x, weight, same in parts if not same]
+            hidden = _linear(each) + _linear(once, first.bias)
+            shape = hidden.shape[:-1]
+            hidden = hidden.reshape(-1, hidden.shape[-1])
+        else:
+            whole = torch.cat(inputs, -1) if len(inputs) > 1 else inputs[0]
+            shape = whole.shape[:-1]
+            # In rows: else the layer's output is a view, and to change a view in place, as ReLU
+            # does here, costs several copies in the gradient.
+            hidden = first(whole.reshape(-1, whole.shape[-1]))
         for layer in rest:
             hidden = layer(hidden)
-        return hidden
+        return hidden.reshape(*shape, hidden.shape[-1])
+
+
+def _linear(parts: Sequence[tuple[Tensor, Tensor]], bias: Tensor | None = None) -> Tensor:
+    """Linear layer of inputs, each with its columns of the weights."""
+    inputs, weights = zip(*parts, strict=True)
+    if len(parts) == 1:
+        return linear(inputs[0], weights[0], bias)
+    return linear(torch.cat(inputs, -1), torch.cat(weights, -1), bias)
 
 
 class Network(TensorDictModule):
