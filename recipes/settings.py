@@ -11,6 +11,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from torchrl_bmrl.agents import LATENT_SOURCES
+from torchrl_bmrl.data.replay import check_device
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.experts.controllers import ExpertGains
 from torchrl_bmrl.names import STEPPERS, TASKS, check_task
@@ -197,6 +198,7 @@ def check_settings(config: Config) -> None:
     for key in ("bcq.critic_grad_clip", "bcq.latent_clip"):
         if (value := OmegaConf.select(settings, key)) is not None and value <= 0:
             raise ConfigError(f"{key} is {value}; valid: above 0, or null")
+    check_device(config.device)
     check_value_bounds(config.bcq.value_bounds)
     for term in config.distill.encoder_terms:
         if term not in ENCODER_TERMS:

@@ -19,7 +19,7 @@ from typing import Any
 import hydra
 import torch
 from omegaconf import DictConfig
-from settings import BCQSettings, Config, run_recipe
+from settings import Config, run_recipe
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.optim import Adam
@@ -90,18 +90,18 @@ def train_job(job: tuple[Config, dict[str, str]], report: Report) -> None:
     train_agents(config, agents, buffer, statistics, report)
 
 
-def make_update(loss: LossModule, optimizers: dict[str, Adam], settings: BCQSettings) -> Update:
+def make_update(
+    loss: LossModule, optimizers: dict[str, Adam], targets: SoftUpdate, max_norm: float | None
+) -> Update:
     """One update of every network that has an optimizer, in their order, and of the targets."""
-    target_updater = SoftUpdate(loss, tau=settings.tau)
 
     def update(batch: TensorDictBase) -> dict[str, Tensor]:
         metrics = {}
         for network, optimizer in optimizers.items():
             value, info = getattr(loss, f"{network}_loss")(batch)
-            clip = settings.critic_grad_clip if network == "qvalue" else None
-            gradient_step(optimizer, value, clip)
+            gradient_step(optimizer, value, max_norm if network == "qvalue" else None)
             metrics |= {f"loss_{network}": value.detach()} | info
-        target_updater.step()
+        targets.step()
         metrics.pop("td_error", None)  # one number per transition
         return metrics
 
@@ -143,6 +143,7 @@ class Training:
             )
             for name in networks
         }
+        self.targets = SoftUpdate(self.loss, tau=config.bcq.tau)  # sets them to the critics
         self.updates = 0
         self.evaluations: dict[str, list[dict]] = {name: [] for name in self.names}
         self.diverged: dict[str, str] = {}  # by name, what was not finite
@@ -186,7 +187,7 @@ class Training:
         load_state(self.loss, state["loss"], self.path)
         for name, optimizer in self.optimizers.items():
             load_adam(optimizer, state["optimizers"][name])
-        set_rng_state(state["rng"])
+        set_rng_state(state["rng"], self.config.device)
         self.updates = metadata["updates"]
         if self.kind == "bcq":
             self.evaluations = {self.names[0]: metadata["evaluations"]}
@@ -243,11 +244,18 @@ def train_agents(
     total = settings.epochs * settings.updates_per_epoch
     training = Training(config, agents, statistics)
     training.load()
-    options = {"compiled": config.compile, "captured": config.cudagraphs, "device": config.device}
-    first = {"generator": training.optimizers["generator"]}
-    warm_up = accelerate(make_update(training.loss, first, settings), **options)
-    update_all = accelerate(make_update(training.loss, training.optimizers, settings), **options)
-    report(training.updates * len(agents))
+
+    def accelerated(*networks: str) -> Update:
+        chosen = {name: training.optimizers[name] for name in networks}
+        update = make_update(training.loss, chosen, training.targets, settings.critic_grad_clip)
+        return accelerate(
+            update, compiled=config.compile, captured=config.cudagraphs, device=config.device
+        )
+
+    update_all = accelerated(*training.optimizers)
+    warm_up = accelerated("generator") if settings.generator_warmup else update_all
+    if training.updates:
+        report(training.updates * len(agents))
     loggers = {}
     if training.updates < total:
         run_dir = Path(config.run_dir)

@@ -138,6 +138,9 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
         ("distill.metric_weight=-1", "distill.metric_weight is -1.0; valid: 0 or above"),
         ("workers=0", "workers is 0"),
         ("bcq.lr=0", "bcq.lr is 0"),
+        ("bcq.seeds=0", "bcq.seeds is 0"),
+        ("bcq.target_dtype=float8", "bcq.target_dtype 'float8'; .*None, bfloat16"),
+        ("device=gpu", "device is 'gpu'; valid: one that torch can use"),
         ("bcq.eval_episodes=0", "bcq.eval_episodes is 0"),
         ("evaluate.episodes=-1", "evaluate.episodes is -1"),
         ("checkpoint_interval=0", "checkpoint_interval is 0"),
@@ -384,6 +387,173 @@ def test_stage_1_resumed_equals_never_stopped(
     assert contents(tmp_path, "bcq/lift/*") == expected
 
 
+STACKED = ("bcq.stacked=true", "bcq.seeds=2")
+AGENTS = {"reach": "reach", "lift": "lift", "reach-1": "reach", "lift-1": "lift"}
+
+
+@pytest.fixture(scope="module")
+def stacked(run: Run, finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Stage 1 of two tasks and two seeds in one program, never stopped."""
+    import train_bcq
+
+    folder = tmp_path_factory.mktemp("stacked")
+    shutil.copytree(finished / "data", folder / "data")
+    return run(folder, train_bcq.train_all, *STACKED)
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_every_member_of_a_stack_has_a_checkpoint_and_curves_of_its_own(stacked: Path) -> None:
+    from torchrl_bmrl.agents import load_bcq_loss
+
+    weights = set()
+    for name, task in AGENTS.items():
+        loss, metadata = load_bcq_loss(stacked / "bcq" / name / "checkpoint.safetensors")
+        assert (metadata["task"], metadata["updates"]) == (task, 12)
+        weights.add(float(next(loss.generator_params.parameters()).sum()))
+        with (stacked / "bcq" / name / "evaluations.csv").open() as file:
+            assert [row["update"] for row in csv.DictReader(file)] == ["6", "12"]
+        curve = stacked / "logs" / f"bcq_{name}" / "scalars" / "loss_qvalue.csv"
+        assert [line.split(",")[0] for line in curve.read_text().splitlines()] == ["4", "8", "12"]
+    assert len(weights) == len(AGENTS)
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+@pytest.mark.parametrize(("update", "kept"), [(3, None), (7, 4), (12, 8)])
+def test_a_stack_resumed_equals_one_never_stopped(
+    run: Run, stacked: Path, finished: Path, tmp_path: Path, update: int, kept: int | None
+) -> None:
+    import train_bcq
+
+    from torchrl_bmrl.agents import load_bcq_loss
+
+    shutil.copytree(finished / "data", tmp_path / "data")
+    config = OmegaConf.to_object(configured(*SMALL, *STACKED, f"run_dir={tmp_path}"))
+    with pytest.raises(KeyboardInterrupt):
+        train_bcq.train_job((config, AGENTS), Interruption(update * len(AGENTS), KeyboardInterrupt))
+    member = tmp_path / "bcq" / "lift" / "checkpoint.safetensors"
+    assert member.exists() == (kept is not None)
+    if kept is not None:
+        assert load_bcq_loss(member)[1]["updates"] == kept
+        member.unlink()  # as if the kill had come before it was written
+    counted: list[int] = []
+    train_bcq.train_job((config, AGENTS), counted.append)
+    assert sum(counted) == 12 * len(AGENTS)
+    expected = contents(stacked, "bcq/**/*")
+    assert len(expected) == 1 + 2 * len(AGENTS)
+    assert contents(tmp_path, "bcq/**/*") == expected
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_a_member_that_diverges_is_named_and_frozen_and_the_others_go_on(
+    run: Run,
+    stacked: Path,
+    finished: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    import train_bcq
+
+    from torchrl_bmrl.agents import load_bcq_loss
+
+    shutil.copytree(finished / "data", tmp_path / "data")
+    step, calls = train_bcq.gradient_step, []
+
+    def breaking(optimizer: Any, loss: Any, max_norm: Any) -> None:
+        calls.append(loss)
+        if len(calls) == 2 * 6:  # the critics' sixth
+            loss = loss * torch.tensor([1.0, float("nan"), 1.0, 1.0])
+        step(optimizer, loss, max_norm)
+
+    monkeypatch.setattr(train_bcq, "gradient_step", breaking)
+    for _ in range(2):  # said again when the command is repeated
+        with pytest.raises(SystemExit) as caught:
+            run(tmp_path, train_bcq.train_all, *STACKED)
+        assert caught.value.code == 1
+        says = "bcq lift, update 8: loss_qvalue is nan"
+        message = capsys.readouterr().err
+        assert f"error: {says}" in message
+    assert len(calls) == 2 * 12
+    updates = {
+        name: load_bcq_loss(tmp_path / "bcq" / name / "checkpoint.safetensors")[1]["updates"]
+        for name in AGENTS
+    }
+    assert updates == {"reach": 12, "lift": 4, "reach-1": 12, "lift-1": 12}
+    others = [f"bcq/{name}/*" for name in AGENTS if name != "lift"]
+    assert contents(tmp_path, *others) == contents(stacked, *others)
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_a_single_agent_that_diverges_ends_the_run_with_its_last_checkpoint(
+    run: Run,
+    finished: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    import train_bcq
+
+    from torchrl_bmrl.agents import load_bcq_loss
+
+    shutil.copytree(finished / "data", tmp_path / "data")
+    step, calls = train_bcq.gradient_step, []
+
+    def breaking(optimizer: Any, loss: Any, max_norm: Any) -> None:
+        calls.append(loss)
+        step(optimizer, loss * (float("nan") if len(calls) == 2 * 6 else 1.0), max_norm)
+
+    monkeypatch.setattr(train_bcq, "gradient_step", breaking)
+    with pytest.raises(SystemExit):
+        run(tmp_path, train_bcq.train_all, "tasks=[lift]")
+    assert "error: bcq lift, update 8: loss_qvalue is nan" in capsys.readouterr().err
+    path = tmp_path / "bcq" / "lift" / "checkpoint.safetensors"
+    assert load_bcq_loss(path)[1]["updates"] == 4
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+@pytest.mark.skipif(not any(map(shutil.which, ("c++", "g++"))), reason="no compiler")
+def test_compiled_stages_train_what_eager_ones_do(
+    run: Run, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import distill
+    import train_bcq
+
+    from torchrl_bmrl.checkpoint import load_checkpoint
+
+    shutil.copytree(finished / "data", tmp_path / "data")
+    for stage in (train_bcq.train_all, distill.distill):
+        run(tmp_path, stage, "compile=true")
+    assert "not accelerated" not in capsys.readouterr().err
+    for path, kind, key in (
+        ("bcq/lift/checkpoint.safetensors", "bcq", "loss"),
+        ("distill/checkpoint.safetensors", "student", "student"),
+    ):
+        compiled, eager = (
+            load_checkpoint(folder / path, kind=kind)[0][key] for folder in (tmp_path, finished)
+        )
+        for name, value in eager.items():
+            torch.testing.assert_close(compiled[name], value, rtol=0, atol=1e-4)
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_without_a_gpu_captured_stages_say_so_and_train_the_same(
+    run: Run, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import train_bcq
+
+    shutil.copytree(finished / "data", tmp_path / "data")
+    run(tmp_path, train_bcq.train_all, "cudagraphs=true", "tasks=[lift]")
+    assert "device=cpu has no CUDA graphs" in capsys.readouterr().err
+    expected = contents(finished, "bcq/lift/*")
+    assert contents(tmp_path, "bcq/lift/*") == expected
+
+
 def trained(
     finished: Path, folder: Path, *overrides: str
 ) -> tuple[dict[str, Any], float, set[str]]:
@@ -577,7 +747,7 @@ def test_learning_from_people_compares_every_share_and_goes_on(
 
     # What the agents trained on: ten scripted transitions, then the human ones.
     buffers: list[Any] = []
-    monkeypatch.setattr(learn_from_people, "train_agents", lambda *given: buffers.append(given[3]))
+    monkeypatch.setattr(learn_from_people, "train_agents", lambda *given: buffers.append(given[2]))
     config = OmegaConf.to_object(configured(*SMALL, f"run_dir={tmp_path}"))
     for share in (0.0, 1.0):
         learn_from_people.train_job((config, share, 0), lambda _: None)

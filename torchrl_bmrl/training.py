@@ -87,18 +87,23 @@ def gradient_step(optimizer: Adam, loss: Tensor, max_norm: float | None = None) 
     # The fused kernel goes through memory as the parameter lies; vmap's gradients lie otherwise.
     grads = [grad.contiguous() for grad in grads]
     state = [optimizer.state[param] for param in params]
+    steps, rate = [each["step"] for each in state], group["lr"]
     beta1, beta2 = group["betas"]
     compiling = torch.compiler.is_compiling()
     with torch.no_grad():
         if max_norm is not None:
             grads = _clipped(grads, max_norm, loss.ndim)
+        if compiling:
+            # 1 - 0.999 has four digits in float32; the fused kernel counts in float64 as well.
+            counted, rate = [step.double() for step in steps], rate.double()
+            torch._foreach_add_(steps, 1.0)
         adam(
             params,
             grads,
             [each["exp_avg"] for each in state],
             [each["exp_avg_sq"] for each in state],
             [],
-            [each["step"] for each in state],
+            counted if compiling else steps,
             # The compiler takes the fused kernel for a black box and the other apart.
             fused=not compiling,
             foreach=compiling,
@@ -106,7 +111,7 @@ def gradient_step(optimizer: Adam, loss: Tensor, max_norm: float | None = None) 
             amsgrad=False,
             beta1=beta1,
             beta2=beta2,
-            lr=group["lr"],
+            lr=rate,
             weight_decay=0.0,
             eps=group["eps"],
             maximize=False,

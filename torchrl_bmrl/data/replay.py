@@ -191,7 +191,7 @@ def _make_buffer(
     prefetch: int | None,
     scratch_dir: str | None,
 ) -> TensorDictReplayBuffer:
-    target = _check_device(device)
+    target = check_device(device)
     sizes = [len(data) for data in datasets]
     if target.type != "cpu" and fits(datasets, target):
         storage = LazyTensorStorage(sum(sizes), device=target)
@@ -236,7 +236,16 @@ def _check_count(name: str, value: Any, least: int) -> None:
         raise ConfigError(f"{name} is {value!r}; valid: at least {least}, an integer")
 
 
-def _check_device(device: Device) -> torch.device:
+def check_device(device: Device) -> torch.device:
+    """A device that torch can use here.
+
+    Raises:
+        ConfigError: for any other.
+
+    Example:
+        >>> check_device("cpu")
+        device(type='cpu')
+    """
     try:
         return torch.empty(0, device="cpu" if device is None else device).device
     except (AssertionError, RuntimeError, TypeError) as error:

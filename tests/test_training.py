@@ -1,0 +1,260 @@
+"""Updates in one piece: the same eager, compiled and captured."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from helpers import NO_UPDATER, make_bcq_loss, make_distillation_loss, task_transitions, transitions
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torch.nn.utils import clip_grad_norm_
+from torch.utils._python_dispatch import TorchDispatchMode
+from torchrl.objectives import SoftUpdate
+
+from torchrl_bmrl import training
+from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.objectives import StackedLoss
+from torchrl_bmrl.training import accelerate, gradient_step, load_adam, make_adam
+
+pytestmark = pytest.mark.filterwarnings(NO_UPDATER)
+Update = Callable[[TensorDict], dict[str, Tensor]]
+LR = 2**-7  # which every type holds exactly
+compiler = pytest.mark.skipif(
+    not any(map(shutil.which, ("c++", "g++", "clang++"))), reason="no compiler"
+)
+
+
+def a_network() -> nn.Module:
+    torch.manual_seed(0)
+    return nn.Sequential(nn.Linear(3, 8), nn.ReLU(), nn.Linear(8, 1)).double()
+
+
+@pytest.mark.parametrize("max_norm", [None, 0.1, 100.0])
+def test_a_gradient_step_is_backward_and_step(max_norm: float | None) -> None:
+    one, other = a_network(), a_network()
+    ours = make_adam(one.parameters(), lr=LR)
+    theirs = torch.optim.Adam(other.parameters(), lr=LR)
+    for seed in range(20):
+        x = torch.randn(16, 3, generator=torch.Generator().manual_seed(seed)).double()
+        gradient_step(ours, one(x).square().mean(), max_norm)
+        theirs.zero_grad()
+        other(x).square().mean().backward()
+        if max_norm is not None:
+            clip_grad_norm_(other.parameters(), max_norm)
+        theirs.step()
+    for ours_, theirs_ in zip(one.parameters(), other.parameters(), strict=True):
+        torch.testing.assert_close(ours_, theirs_, rtol=1e-9, atol=1e-12)
+        assert ours_.grad is None
+
+
+def test_a_gradient_step_leaves_what_the_loss_does_not_reach() -> None:
+    used, unused = nn.Parameter(torch.ones(1)), nn.Parameter(torch.ones(1))
+    gradient_step(make_adam([used, unused], lr=LR), used.square())
+    assert used.item() < 1
+    assert unused.item() == 1
+
+
+def test_a_changed_learning_rate_counts_from_the_next_step() -> None:
+    weight = nn.Parameter(torch.ones(1))
+    optimizer = make_adam([weight], lr=LR)
+    optimizer.param_groups[0]["lr"].fill_(0.0)
+    gradient_step(optimizer, weight.square())
+    assert weight.item() == 1
+
+
+def test_an_optimizer_goes_on_from_its_state() -> None:
+    def steps(count: int, state: Any = None, weight: float = 1.0) -> tuple[float, Any]:
+        parameter = nn.Parameter(torch.tensor([weight], dtype=torch.float64))
+        optimizer = make_adam([parameter], lr=LR)
+        if state is not None:
+            load_adam(optimizer, state)
+        for _ in range(count):
+            gradient_step(optimizer, parameter.square())
+        return parameter.item(), optimizer.state_dict()
+
+    half, state = steps(5)
+    assert steps(5, state, half)[0] == steps(10)[0] != steps(5, None, half)[0]
+
+
+# -- compiled and captured -------------------------------------------------------------------------
+
+
+def bcq_update(members: int, device: str = "cpu", **options: Any) -> tuple[Any, Update]:
+    """A loss, or a stack of several, and its update as the recipe makes it."""
+    losses = [make_bcq_loss(seed=seed, dtype=torch.float64) for seed in range(max(members, 1))]
+    loss = (StackedLoss(losses, **options) if members else losses[0]).to(device)
+    optimizers = {
+        name: make_adam(getattr(loss, f"{name}_params").parameters(), lr=LR)
+        for name in ("generator", "qvalue_network")
+    }
+    targets = SoftUpdate(loss, tau=0.1)
+
+    def update(batch: TensorDict) -> dict[str, Tensor]:
+        metrics = {}
+        for name, optimizer in optimizers.items():
+            value, info = getattr(loss, f"{name.removesuffix('_network')}_loss")(batch)
+            gradient_step(optimizer, value, 1.0)
+            metrics |= {name: value.detach()} | info
+        targets.step()
+        return metrics
+
+    return loss, update
+
+
+def bcq_batch(members: int, seed: int, device: str = "cpu") -> TensorDict:
+    shape = (members, 8) if members else (8,)
+    batch = transitions(*shape, dtype=torch.float64, seed=seed).to(device)
+    return batch.exclude(("next", "truncated"))
+
+
+def distillation_update(members: int) -> tuple[Any, Update]:
+    loss = make_distillation_loss(dtype=torch.float64, context="set")
+    optimizer = make_adam(loss.parameters(), lr=LR)
+
+    def update(batch: TensorDict) -> dict[str, Tensor]:
+        losses = loss(batch)
+        gradient_step(optimizer, sum(v for k, v in losses.items() if k.startswith("loss_")))
+        return {name: value.detach() for name, value in losses.items()}
+
+    return loss, update
+
+
+def distillation_batch(members: int, seed: int) -> TensorDict:
+    return task_transitions(3, 5, dtype=torch.float64).exclude("previous")
+
+
+CASES = {
+    "bcq": (bcq_update, bcq_batch, 0),
+    "stacked_bcq": (bcq_update, bcq_batch, 2),
+    "distillation": (distillation_update, distillation_batch, 0),
+}
+
+
+@compiler
+@pytest.mark.slow
+@pytest.mark.parametrize(("make", "batch", "members"), CASES.values(), ids=CASES)
+def test_a_compiled_update_is_one_program_and_equals_the_eager_one(
+    make: Any, batch: Any, members: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    torch.compiler.reset()
+    states = []
+    for compiled in (False, True):
+        loss, update = make(members)
+        update = accelerate(update, compiled=compiled)
+        torch.manual_seed(0)
+        for seed in range(50):
+            # From the second update on nothing may be compiled anew.
+            with torch._dynamo.config.patch(error_on_recompile=seed > 1):
+                metrics = update(batch(members, seed))
+        states.append((loss.state_dict(), metrics))
+    assert capsys.readouterr().err == ""  # no fallback
+    for eager, fast in zip(*states, strict=True):
+        assert eager.keys() == fast.keys()
+        for key, value in eager.items():
+            torch.testing.assert_close(fast[key], value, rtol=0, atol=1e-10)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_captured_update_equals_the_eager_one(
+    compiled: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(torch, "randn", lambda *s, **o: torch.full(as_size(s), 0.3, **o))
+    monkeypatch.setattr(torch, "randn_like", lambda x: torch.full_like(x, 0.3))
+    states = []
+    for options in ({}, {"compiled": compiled, "captured": True}):
+        loss, update = bcq_update(3, "cuda")
+        update = accelerate(update, device="cuda", **options)
+        for seed in range(50):
+            metrics = update(bcq_batch(3, seed, "cuda"))
+        states.append((loss.state_dict(), metrics))
+    assert capsys.readouterr().err == ""
+    for eager, fast in zip(*states, strict=True):
+        for key, value in eager.items():
+            torch.testing.assert_close(fast[key], value, rtol=0, atol=1e-10)
+
+
+@pytest.mark.gpu
+def test_every_replay_draws_new_noise() -> None:
+    _, update = bcq_update(2, "cuda")
+    update = accelerate(update, device="cuda", captured=True)
+    values = [update(bcq_batch(2, 0, "cuda"))["next_state_value"].tolist() for _ in range(10)]
+    assert len({tuple(value) for value in values}) == 10
+
+
+def as_size(shape: tuple[Any, ...]) -> Any:
+    return shape[0] if len(shape) == 1 and not isinstance(shape[0], int) else shape
+
+
+class Waiting(TorchDispatchMode):
+    """Refuses what would make Python wait for a device."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        names = ("_local_scalar_dense", "nonzero", "masked_select", "equal", "is_nonzero")
+        assert func.overloadpacket.__name__ not in names, func
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("members", [0, 3])
+def test_an_update_never_waits_for_its_device(
+    members: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from torchrl_bmrl.objectives import checks
+
+    _, update = bcq_update(members, **({"deactivate_vmap": False} if members else {}))
+    batch = bcq_batch(members, 0)
+    with pytest.raises(AssertionError, match="_local_scalar_dense"), Waiting():
+        update(batch)  # on CPU the data are looked at
+    monkeypatch.setattr(checks, "readable", lambda value: False)  # as on another device
+    with Waiting():
+        update(batch)
+
+
+# -- where it fails --------------------------------------------------------------------------------
+
+
+def test_an_update_that_cannot_be_compiled_runs_as_it_is(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    calls = []
+
+    def update(batch: TensorDict) -> dict[str, Tensor]:
+        calls.append(batch["x"].sum().item())  # looks at a number
+        if calls[-1] > 0:
+            print("positive")
+        return {"x": batch["x"]}
+
+    fast = accelerate(update, compiled=True)
+    batch = TensorDict({"x": torch.ones(2)}, [2])
+    for _ in range(3):
+        assert fast(batch)["x"] is batch["x"]
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("updates are not accelerated (")
+    assert line.endswith("they run as is")
+    assert calls == [2.0] * 3
+
+
+def test_without_a_gpu_nothing_is_captured_and_that_is_said(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    _, update = bcq_update(0)
+    assert accelerate(update, captured=True) is update
+    assert capsys.readouterr().err == "device=cpu has no CUDA graphs; the updates run without\n"
+
+
+def test_an_error_of_the_update_itself_is_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    def update(batch: TensorDict) -> dict[str, Tensor]:
+        raise BMRLError("'action' is missing")
+
+    monkeypatch.setattr(training, "_prepare_compiler", lambda on_gpu: None)
+    with pytest.raises(BMRLError, match="'action' is missing"):
+        accelerate(update, compiled=True)(TensorDict({}, []))
+
+
+def test_nothing_is_wrapped_that_was_not_asked_for() -> None:
+    _, update = bcq_update(0)
+    assert accelerate(update) is update
