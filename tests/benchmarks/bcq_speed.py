@@ -1,10 +1,15 @@
-"""Updates per second of BCQLoss beside plain PyTorch.
+"""Updates per second of BCQ: this library, plain PyTorch, d3rlpy, and the products alone.
 
-    python tests/benchmarks/bcq_speed.py [--rounds 40] [--updates 5] [--batch-sizes 100 256]
+    python tests/benchmarks/bcq_speed.py [--rounds 40] [--batch-sizes 100 256] [--members 6]
+    python tests/benchmarks/bcq_speed.py --device cuda --members 1 2 4 6 8 16 32 64
 
 An update is what one step of training does, without the sampling of its batch: VAE step, critic
-step, soft update of the targets. The variants take turns in one process; each round gives one ratio
-to plain PyTorch, the table their medians, so that what else the machine does matters little.
+step, soft update of the targets; of a stack it counts once per member. The variants take turns in
+one process; each round gives one ratio to plain PyTorch and one to the limit, the table their
+medians, so that what else the machine does matters little.
+
+The limit is the time that the update's matrix products take by themselves, into memory that is
+there already: forward, gradients, and next actions whose states' part is computed once.
 """
 
 from __future__ import annotations
@@ -14,28 +19,33 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported
 
 import argparse
+import subprocess
 import warnings
 from collections.abc import Callable
-from itertools import cycle
+from itertools import cycle, pairwise
+from pathlib import Path
 from statistics import median
 from time import perf_counter
 from typing import Any
 
 import torch
-import torch._inductor.config
 from plain_bcq import PlainBCQ
 from tensordict import TensorDict
 from torch import Tensor, nn
-from torchrl.objectives import SoftUpdate
+from torchrl.objectives import LossModule, SoftUpdate
 
-from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
-from torchrl_bmrl.objectives import BCQLoss
+from torchrl_bmrl.modules import ActionVAE, make_perturbation_network, make_qvalue_network
+from torchrl_bmrl.objectives import BCQLoss, StackedLoss
+from torchrl_bmrl.training import accelerate, gradient_step, make_adam
 
 OBSERVATION_DIM, ACTION_DIM = 33, 7
+WIDTH = 256
 BATCH_SIZES = (100, 256)
+NETWORKS = ("generator", "qvalue_network", "perturbation_network")  # in update order
+LIMIT, PLAIN = "matrix products alone", "plain PyTorch"
 TAU, LR = 0.005, 1e-3
 WARM_UP = 5
-Update = Callable[[TensorDict], tuple[Tensor, Tensor]]
+Update = Callable[[TensorDict], tuple[Tensor, ...]]
 
 
 def make_batch(rows: int, seed: int = 0) -> TensorDict:
@@ -57,12 +67,14 @@ def copy_weights(source: nn.Module, destination: nn.Module) -> None:
         taken.data.copy_(given.data)
 
 
-def make_pair(seed: int = 0) -> tuple[PlainBCQ, BCQLoss]:
+def make_pair(
+    seed: int = 0, *, device: str = "cpu", perturbation: bool = False, **options: Any
+) -> tuple[PlainBCQ, BCQLoss]:
     """Both with the same weights, targets included."""
     torch.manual_seed(seed)
     generator = ActionVAE(OBSERVATION_DIM, ACTION_DIM)
     critics = [make_qvalue_network(OBSERVATION_DIM, ACTION_DIM) for _ in range(2)]
-    plain = PlainBCQ(OBSERVATION_DIM, ACTION_DIM, tau=TAU, lr=LR)
+    plain = PlainBCQ(OBSERVATION_DIM, ACTION_DIM, tau=TAU, lr=LR, device=device)
     copy_weights(generator.encoder, plain.vae.encoder)
     copy_weights(generator.decoder, plain.vae.decoder)
     for critic, trained, target in zip(
@@ -73,7 +85,8 @@ def make_pair(seed: int = 0) -> tuple[PlainBCQ, BCQLoss]:
     ):
         copy_weights(critic, trained)
         copy_weights(critic, target)
-    return plain, BCQLoss(generator, critics, bounds=(-1.0, 1.0))
+    network = make_perturbation_network(OBSERVATION_DIM, ACTION_DIM) if perturbation else None
+    return plain, BCQLoss(generator, critics, network, bounds=(-1.0, 1.0), **options).to(device)
 
 
 def plain_arguments(batch: TensorDict) -> tuple[Tensor, ...]:
@@ -87,52 +100,130 @@ def plain_arguments(batch: TensorDict) -> tuple[Tensor, ...]:
     )
 
 
-def make_plain_update(plain: PlainBCQ, compiled: str | None = None) -> Update:
-    """``compiled``: ``None``, ``"losses"`` or the whole ``"update"``."""
-    if compiled == "losses":
-        plain.vae_loss = torch.compile(plain.vae_loss, fullgraph=True)
-        plain.critic_loss = torch.compile(plain.critic_loss, fullgraph=True)
-    step = torch.compile(plain.update) if compiled == "update" else plain.update
+def make_plain_update(device: str = "cpu", compiled: bool = False) -> Update:
+    plain = make_pair(device=device)[0]
+    step = torch.compile(plain.update) if compiled else plain.update
+    return lambda batch: step(*plain_arguments(batch))
 
-    def update(batch: TensorDict) -> tuple[Tensor, Tensor]:
-        return step(*plain_arguments(batch))
+
+def make_library_update(loss: LossModule, **options: Any) -> Update:
+    """One update as ``recipes/train_bcq.py`` does it; ``options`` are of ``accelerate``."""
+    targets = SoftUpdate(loss, tau=TAU)
+    names = [name for name in NETWORKS if getattr(loss, f"{name}_params", None) is not None]
+    optimizers = {
+        f"{name.removesuffix('_network')}_loss": make_adam(
+            getattr(loss, f"{name}_params").parameters(), lr=LR
+        )
+        for name in names
+    }
+
+    def update(batch: TensorDict) -> dict[str, Tensor]:
+        values = {}
+        for name, optimizer in optimizers.items():
+            values[name], _ = getattr(loss, name)(batch)
+            gradient_step(optimizer, values[name])
+        targets.step()
+        return {name: value.detach() for name, value in values.items()}
+
+    fast = accelerate(update, **options)
+    return lambda batch: tuple(fast(batch).values())
+
+
+def make_alone(device: str = "cpu", accelerated: str = "", **options: Any) -> Update:
+    loss = make_pair(device=device, **options)[1]
+    return make_library_update(loss, device=device, **dict.fromkeys(accelerated.split(), True))
+
+
+def make_stack(members: int, device: str = "cpu", accelerated: str = "") -> Update:
+    """One update of every member, all on the same batch."""
+    stack = StackedLoss([make_pair(seed)[1] for seed in range(members)]).to(device)
+    options = dict.fromkeys(accelerated.split(), True)
+    update = make_library_update(stack, device=device, **options)
+    return lambda batch: update(batch.expand(members, *batch.batch_size))
+
+
+def make_products(rows: int, device: str = "cpu", num_candidates: int = 10) -> Update:
+    """The matrix products of one update and nothing else."""
+    state, action, latent = OBSERVATION_DIM, ACTION_DIM, 2 * ACTION_DIM
+    shapes = []  # rows of the left matrix, columns of it, columns of the right one
+
+    def forward(sizes: tuple[int, ...], height: int) -> None:
+        shapes.extend((height, i, o) for i, o in pairwise(sizes))
+
+    def train(inputs: int, outputs: int, *, into_input: int = 0) -> None:
+        sizes = (inputs, WIDTH, WIDTH, outputs)
+        forward(sizes, rows)
+        shapes.extend((i, rows, o) for i, o in pairwise(sizes))  # gradients of the weights
+        backwards = [(rows, o, i) for i, o in pairwise(sizes)][1:]  # and of what they multiply
+        shapes.extend([*backwards, *([(rows, WIDTH, into_input)] if into_input else [])])
+
+    train(state + action, 2 * latent)
+    train(state + latent, action, into_input=latent)
+    for inputs, outputs in ((latent, action), (action, 1), (action, 1)):  # decoder, two critics
+        shapes.append((rows, state, WIDTH))
+        forward((inputs, WIDTH, WIDTH, outputs), rows * num_candidates)
+    for _ in range(2):
+        train(state + action, 1)
+    matrices = [
+        [torch.randn(size, device=device) for size in ((n, i), (i, o), (n, o))]
+        for n, i, o in shapes
+    ]
+
+    def update(batch: TensorDict) -> tuple[Tensor]:
+        for left, right, out in matrices:
+            torch.mm(left, right, out=out)
+        return (out,)
 
     return update
 
 
-def make_library_update(loss: BCQLoss, compiled: str | None = None) -> Update:
-    """One update as ``recipes/train_bcq.py`` does it; ``compiled`` as above."""
-    targets = SoftUpdate(loss, tau=TAU)
-    generator_loss, qvalue_loss = loss.generator_loss, loss.qvalue_loss
-    if compiled == "losses":
-        generator_loss = torch.compile(generator_loss, fullgraph=True)
-        qvalue_loss = torch.compile(qvalue_loss, fullgraph=True)
-    generator_optimizer = torch.optim.Adam(loss.generator_params.parameters(), lr=LR)
-    qvalue_optimizer = torch.optim.Adam(loss.qvalue_network_params.parameters(), lr=LR)
-    parts = ((generator_loss, generator_optimizer), (qvalue_loss, qvalue_optimizer))
+class Outside:
+    """d3rlpy's updates, done and timed by another process; see ``d3rlpy_bcq.py``."""
 
-    def update(batch: TensorDict) -> tuple[Tensor, Tensor]:
-        values = []
-        for part, optimizer in parts:
-            value, _ = part(batch)
-            optimizer.zero_grad(set_to_none=True)
-            value.backward()
-            optimizer.step()
-            values.append(value.detach())
-        targets.step()
-        return values[0], values[1]
+    def __init__(self, python: str, rows: int) -> None:
+        script = Path(__file__).with_name("d3rlpy_bcq.py")
+        self.process = subprocess.Popen(
+            [python, str(script), str(rows), "10"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
 
-    return torch.compile(update) if compiled == "update" else update
+    def seconds(self, updates: int) -> float:
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(f"{updates}\n")
+        self.process.stdin.flush()
+        for line in self.process.stdout:  # what it says of itself comes first
+            if line[0].isdigit():
+                return float(line)
+        raise RuntimeError("d3rlpy_bcq.py ended; run it by itself to see why")
 
 
-VARIANTS: dict[str, Callable[[], Update]] = {
-    "plain": lambda: make_plain_update(make_pair()[0]),
-    "BCQLoss": lambda: make_library_update(make_pair()[1]),
-    "BCQLoss, losses compiled": lambda: make_library_update(make_pair()[1], "losses"),
-    "BCQLoss, update compiled": lambda: make_library_update(make_pair()[1], "update"),
-    "plain, losses compiled": lambda: make_plain_update(make_pair()[0], "losses"),
-    "plain, update compiled": lambda: make_plain_update(make_pair()[0], "update"),
-}
+def variants(rows: int, device: str, members: list[int]) -> dict[str, tuple[Update, int]]:
+    """By name, an update and for how many members it counts."""
+    bfloat16 = {"target_dtype": "bfloat16"}
+    made: dict[str, tuple[Update, int]] = {
+        LIMIT: (make_products(rows, device), 1),
+        PLAIN: (make_plain_update(device), 1),
+        "plain PyTorch, compiled": (make_plain_update(device, compiled=True), 1),
+        "BCQLoss": (make_alone(device), 1),
+        "BCQLoss, compiled": (make_alone(device, "compiled"), 1),
+        "BCQLoss, bfloat16 targets": (make_alone(device, **bfloat16), 1),
+        "BCQLoss, bfloat16 targets, compiled": (make_alone(device, "compiled", **bfloat16), 1),
+        "BCQLoss with perturbation": (make_alone(device, perturbation=True), 1),
+        "BCQLoss with perturbation, compiled": (
+            make_alone(device, "compiled", perturbation=True),
+            1,
+        ),
+    }
+    captured = ("captured", "compiled captured") if device == "cuda" else ("compiled",)
+    for count in members:
+        for accelerated in ("", *captured):
+            name = ", ".join([f"StackedLoss of {count}", *accelerated.split()])
+            made[name] = (make_stack(count, device, accelerated), count)
+    return made
 
 
 def warmed_up(update: Update, batches: list[TensorDict]) -> Update:
@@ -144,55 +235,96 @@ def warmed_up(update: Update, batches: list[TensorDict]) -> Update:
     return update
 
 
-def measure(rows: int, *, rounds: int, updates: int) -> dict[str, tuple[float, float]]:
-    """Medians over the rounds: updates per second, and the ratio to plain of the same round."""
-    batches = [make_batch(rows, seed) for seed in range(4)]
+def measure(
+    rows: int, *, rounds: int, updates: int, device: str, members: list[int], d3rlpy: str | None
+) -> dict[str, tuple[float, float, float]]:
+    """Medians over the rounds: updates per second, ratio to plain, share of the limit."""
+    batches = [make_batch(rows, seed).to(device) for seed in range(4)]
     torch.compiler.reset()
-    variants = {name: warmed_up(make(), batches) for name, make in VARIANTS.items()}
+    made = variants(rows, device, members)
+    for update, _ in made.values():
+        warmed_up(update, batches)
+    outside = None if d3rlpy is None else Outside(d3rlpy, rows)
     speeds: list[dict[str, float]] = []
-    for number in range(rounds):
-        order = list(variants) if number % 2 == 0 else list(reversed(variants))
+    for number in range(rounds + 1):
         speed = {}
-        for name in order:
-            update, source = variants[name], cycle(batches)
+        for name in list(made) if number % 2 == 0 else reversed(made):
+            update, count = made[name]
+            source = cycle(batches)
+            wait(device)
             start = perf_counter()
             for _ in range(updates):
                 update(next(source))
-            speed[name] = updates / (perf_counter() - start)
+            wait(device)
+            speed[name] = updates * count / (perf_counter() - start)
+        if outside is not None:
+            speed["d3rlpy's BCQ, with perturbation"] = updates / outside.seconds(updates)
         speeds.append(speed)
+    names = list(speeds.pop(0))  # the first round warms up what is outside
     return {
         name: (
             median(speed[name] for speed in speeds),
-            median(speed[name] / speed["plain"] for speed in speeds),
+            median(speed[name] / speed[PLAIN] for speed in speeds),
+            median(speed[name] / speed[LIMIT] for speed in speeds),
         )
-        for name in variants
+        for name in names
     }
 
 
+def wait(device: str) -> None:
+    if device == "cuda":
+        torch.cuda.synchronize()
+
+
+def product_speed(dtype: torch.dtype, device: str) -> float:
+    """GFLOP/s of a layer over 1000 candidates, the best of several runs."""
+    left = torch.randn(1000, WIDTH, device=device).to(dtype)
+    right = torch.randn(WIDTH, WIDTH, device=device).to(dtype)
+    seconds = []
+    for _ in range(20):
+        wait(device)
+        start = perf_counter()
+        for _ in range(10):
+            nn.functional.linear(left, right)
+        wait(device)
+        seconds.append((perf_counter() - start) / 10)
+    return 2 * 1000 * WIDTH**2 / min(seconds) / 1e9
+
+
 def main(arguments: list[str] | None = None) -> None:
-    summary = "Updates per second of BCQLoss beside plain PyTorch, one thread."
-    parser = argparse.ArgumentParser(description=summary)
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     options: dict[str, dict[str, Any]] = {
         "--rounds": {"type": int, "default": 40},
         "--updates": {"type": int, "default": 5, "help": "updates per variant and round"},
         "--batch-sizes": {"type": int, "nargs": "+", "default": list(BATCH_SIZES)},
+        "--members": {"type": int, "nargs": "*", "default": [6], "help": "sizes of stacks"},
+        "--device": {"choices": ["cpu", "cuda"], "default": "cpu"},
+        "--d3rlpy": {"metavar": "PYTHON", "help": "an interpreter that has d3rlpy"},
     }
     for name, option in options.items():
         parser.add_argument(name, **option)
     args = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    # The compiler's own random numbers are slow on CPU; with eager's a compiled loss also draws
-    # what the eager one draws.
-    torch._inductor.config.fallback_random = True
-
-    results = {
-        rows: measure(rows, rounds=args.rounds, updates=args.updates) for rows in args.batch_sizes
+    speeds = {
+        str(dtype).removeprefix("torch."): product_speed(dtype, args.device)
+        for dtype in (torch.float32, torch.bfloat16)
     }
-    print("| Batch | Variant | Updates/s | Ratio to plain |")
-    print("|---:|---|---:|---:|")
-    for rows, table in results.items():
-        for name, (speed, ratio) in table.items():
-            print(f"| {rows} | {name} | {speed:.1f} | {ratio:.2f} |")
+    where = torch.cuda.get_device_name() if args.device == "cuda" else "one CPU core"
+    print(f"{where}; a layer over 1000 candidates, GFLOP/s:", end=" ")
+    print(", ".join(f"{name} {speed:.0f}" for name, speed in speeds.items()), end="\n\n")
+    print("| Batch | Variant | Updates/s | Ratio to plain | Share of the limit |")
+    print("|---:|---|---:|---:|---:|", flush=True)
+    for rows in args.batch_sizes:
+        table = measure(
+            rows,
+            rounds=args.rounds,
+            updates=args.updates,
+            device=args.device,
+            members=args.members,
+            d3rlpy=args.d3rlpy,
+        )
+        for name, (speed, ratio, share) in table.items():
+            print(f"| {rows} | {name} | {speed:.1f} | {ratio:.2f} | {share:.2f} |", flush=True)
 
 
 if __name__ == "__main__":

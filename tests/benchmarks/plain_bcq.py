@@ -68,12 +68,13 @@ class PlainBCQ:
         gamma: float = 0.99,
         tau: float = 0.005,
         lr: float = 1e-3,
+        device: str = "cpu",
     ) -> None:
         self.num_candidates, self.lmbda, self.latent_clip = num_candidates, lmbda, latent_clip
         self.kl_weight, self.gamma, self.tau = kl_weight, gamma, tau
-        self.vae = VAE(observation_dim, action_dim, width)
-        self.critic_1 = Critic(observation_dim, action_dim, width)
-        self.critic_2 = Critic(observation_dim, action_dim, width)
+        self.vae = VAE(observation_dim, action_dim, width).to(device)
+        self.critic_1 = Critic(observation_dim, action_dim, width).to(device)
+        self.critic_2 = Critic(observation_dim, action_dim, width).to(device)
         self.target_1 = deepcopy(self.critic_1).requires_grad_(False)
         self.target_2 = deepcopy(self.critic_2).requires_grad_(False)
         self.vae_optimizer = torch.optim.Adam(self.vae.parameters(), lr=lr)

@@ -11,20 +11,25 @@ from itertools import cycle
 from shutil import which
 from typing import Any
 
+import acting_speed
+import distillation_speed
 import pytest
 import torch
 from bcq_speed import (
     BATCH_SIZES,
-    VARIANTS,
     main,
+    make_alone,
     make_batch,
     make_library_update,
     make_pair,
-    make_plain_update,
+    make_products,
+    make_stack,
+    plain_arguments,
+    variants,
     warmed_up,
 )
+from torch.utils.flop_counter import FlopCounterMode
 
-COMPILED = [name for name in VARIANTS if "compiled" in name]
 needs_compiler = pytest.mark.skipif(
     not (which("g++") or which("clang++")), reason="torch.compile needs a C++ compiler"
 )
@@ -38,14 +43,24 @@ def _no_compiled_code() -> None:
 @pytest.mark.parametrize("rows", BATCH_SIZES)
 def test_plain_and_library_updates_give_equal_losses(rows: int) -> None:
     plain, loss = make_pair()
-    updates = make_plain_update(plain), make_library_update(loss)
+    update = make_library_update(loss)
     for number in range(5):  # from the second on, the optimizers' and the targets' steps count too
-        batch, values = make_batch(rows, seed=number), []
-        for update in updates:
-            torch.manual_seed(number)
-            values.append(torch.stack(update(batch)))
-        torch.testing.assert_close(*values, rtol=1e-4, atol=1e-6)
-    assert values[0].isfinite().all()
+        batch = make_batch(rows, seed=number)
+        torch.manual_seed(number)
+        expected = torch.stack(plain.update(*plain_arguments(batch)))
+        torch.manual_seed(number)
+        torch.testing.assert_close(torch.stack(update(batch)), expected, rtol=1e-4, atol=1e-6)
+    assert expected.isfinite().all()
+
+
+def test_the_limit_is_the_products_of_an_update_of_the_library() -> None:
+    batch, counts = make_batch(100), []
+    for update in (make_products(100), make_alone()):
+        with FlopCounterMode(display=False) as counter:
+            update(batch)
+        counts.append(counter.get_total_flops())
+    # More is the gradient into the observation, which the generator reads beside its latent.
+    assert counts[0] <= counts[1] < 1.005 * counts[0]
 
 
 @needs_compiler
@@ -57,18 +72,23 @@ def test_losses_compile_to_one_graph(method: str) -> None:
     assert (explanation.graph_count, explanation.graph_break_count) == (1, 0)
 
 
+UPDATES: dict[str, Callable[[], Any]] = {
+    "alone": make_alone,
+    "alone, compiled": lambda: make_alone(accelerated="compiled"),
+    "stack of 6": lambda: make_stack(6),
+}
+
+
+@needs_compiler
 @pytest.mark.parametrize("rows", BATCH_SIZES)
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=needs_compiler if name in COMPILED else ()) for name in VARIANTS],
-)
+@pytest.mark.parametrize("name", UPDATES)
 @pytest.mark.filterwarnings("ignore")
 def test_updates_per_second(name: str, rows: int, request: pytest.FixtureRequest) -> None:
     pytest.importorskip("pytest_benchmark")
     benchmark: Callable[..., Any] = request.getfixturevalue("benchmark")
     benchmark.group = f"batch {rows}"
     batches = [make_batch(rows, seed) for seed in range(4)]
-    update, source = warmed_up(VARIANTS[name](), batches), cycle(batches)
+    update, source = warmed_up(UPDATES[name](), batches), cycle(batches)
     values = benchmark(lambda: update(next(source)))
     assert torch.stack(values).isfinite().all()
 
@@ -76,6 +96,24 @@ def test_updates_per_second(name: str, rows: int, request: pytest.FixtureRequest
 @needs_compiler
 @pytest.mark.filterwarnings("ignore")
 def test_script_prints_one_row_per_variant(capsys: pytest.CaptureFixture[str]) -> None:
-    main(["--rounds", "1", "--updates", "1", "--batch-sizes", "8"])
+    main(["--rounds", "1", "--updates", "1", "--batch-sizes", "8", "--members", "2"])
+    _, _, _, _, *rows = capsys.readouterr().out.strip().splitlines()
+    assert [row.split(" | ")[1] for row in rows] == list(variants(8, "cpu", [2]))
+
+
+@pytest.mark.parametrize("states", [1, 5])
+def test_plain_and_library_policies_choose_equal_actions(states: int) -> None:
+    actions = []
+    for act in acting_speed.acting(states).values():
+        torch.manual_seed(0)
+        actions.append(act())
+    torch.testing.assert_close(*actions, rtol=0, atol=1e-5)
+
+
+@needs_compiler
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("script", [acting_speed, distillation_speed])
+def test_other_scripts_print_their_tables(script: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    script.main(["--rounds", "1"])
     _, _, *rows = capsys.readouterr().out.strip().splitlines()
-    assert [row.split(" | ")[1] for row in rows] == list(VARIANTS)
+    assert len(rows) == {acting_speed: 8, distillation_speed: 4}[script]

@@ -1,0 +1,115 @@
+"""Updates per second of stage 2: teachers one after the other or stacked, eager or compiled.
+
+    python tests/benchmarks/distillation_speed.py [--rounds 40] [--device cuda]
+
+Six teachers, 64 transitions of each task, the recipe's loss. Without the sampling of the batch.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported
+
+import argparse
+from collections.abc import Callable
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+import torch
+from bcq_speed import ACTION_DIM, LR, OBSERVATION_DIM, make_batch, wait, warmed_up
+from tensordict import TensorDict
+
+from torchrl_bmrl.agents import Student, make_bcq_loss
+from torchrl_bmrl.modules import BCQPolicy
+from torchrl_bmrl.objectives import MetaDistillationLoss
+from torchrl_bmrl.training import accelerate, gradient_step, make_adam
+
+TASKS, ROWS = 6, 64
+
+
+def make_data(device: str = "cpu") -> TensorDict:
+    """Random transitions of every task."""
+    data = torch.stack([make_batch(ROWS, seed) for seed in range(TASKS)])
+    data["task"] = torch.arange(TASKS).unsqueeze(-1).expand(TASKS, ROWS).clone()
+    return data.to(device)
+
+
+def make_update(
+    device: str = "cpu", *, in_sequence: bool = False, optimizer: str = "step", **options: Any
+) -> Callable[[TensorDict], Any]:
+    """One update; ``optimizer`` is ``"step"`` as in the recipe or PyTorch's own ``"backward"``."""
+    torch.manual_seed(0)
+    losses = [make_bcq_loss(observation_dim=OBSERVATION_DIM, action_dim=ACTION_DIM)] * TASKS
+    teachers = [BCQPolicy.from_loss(loss) for loss in losses]
+    student = Student(num_tasks=TASKS)
+    loss = MetaDistillationLoss(
+        student.task_encoder,
+        student.task_classifier,
+        student.generator,
+        student.qvalue_network,
+        [teacher.decoder for teacher in teachers],
+        [teacher.qvalue_network for teacher in teachers],
+        latent_dim=teachers[0].latent_dim,
+        deactivate_vmap=in_sequence,
+    ).to(device)
+    ours = make_adam(loss.parameters(), lr=LR)
+    theirs = torch.optim.Adam(loss.parameters(), lr=LR)
+
+    def update(batch: TensorDict) -> Any:
+        losses = loss(batch)
+        total = sum(value for name, value in losses.items() if name.startswith("loss_"))
+        if optimizer == "step":
+            gradient_step(ours, total)
+        else:
+            theirs.zero_grad()
+            total.backward()
+            theirs.step()
+        return {name: value.detach() for name, value in losses.items()}
+
+    return accelerate(update, device=device, **options)
+
+
+def variants(device: str) -> dict[str, Callable[[TensorDict], Any]]:
+    """By name, an update."""
+    made = {
+        "teachers in sequence, torch.optim": make_update(
+            device, in_sequence=True, optimizer="backward"
+        ),
+        "teachers in sequence": make_update(device, in_sequence=True),
+        "teachers stacked": make_update(device),
+        "teachers stacked, compiled": make_update(device, compiled=True),
+    }
+    if device == "cuda":
+        made["teachers stacked, captured"] = make_update(device, captured=True)
+    return made
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=40)
+    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
+    args = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    data = make_data(args.device)
+    updates = {name: warmed_up(update, [data]) for name, update in variants(args.device).items()}
+    speeds: dict[str, list[float]] = {name: [] for name in updates}
+    for _ in range(args.rounds):
+        for name, update in updates.items():
+            wait(args.device)
+            start = perf_counter()
+            for _ in range(5):
+                update(data)
+            wait(args.device)
+            speeds[name].append(5 / (perf_counter() - start))
+    first = next(iter(speeds.values()))
+    print("| Stage 2 | Updates/s | Ratio to the first |\n|---|---:|---:|")
+    for name, values in speeds.items():
+        ratio = median(a / b for a, b in zip(values, first, strict=True))
+        print(f"| {name} | {median(values):.1f} | {ratio:.2f} |")
+
+
+if __name__ == "__main__":
+    main()
