@@ -34,6 +34,7 @@ from torchrl_bmrl.training import (
     accelerate,
     get_rng_state,
     gradient_step,
+    keep_freed_memory,
     load_adam,
     make_adam,
     set_rng_state,
@@ -73,6 +74,7 @@ def value_statistics(
 
 def train_student(config: Config, report: Report) -> None:
     """Trains the student, or goes on from its checkpoint."""
+    keep_freed_memory()
     settings, run_dir = config.distill, Path(config.run_dir)
     path = run_dir / "distill" / "checkpoint.safetensors"
     statistics = read_statistics(run_dir / "data")

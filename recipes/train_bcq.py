@@ -44,6 +44,7 @@ from torchrl_bmrl.training import (
     accelerate,
     get_rng_state,
     gradient_step,
+    keep_freed_memory,
     load_adam,
     make_adam,
     set_rng_state,
@@ -242,6 +243,7 @@ def train_agents(
     """
     settings = config.bcq
     total = settings.epochs * settings.updates_per_epoch
+    keep_freed_memory()
     training = Training(config, agents, statistics)
     training.load()
 

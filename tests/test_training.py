@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import platform
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -78,6 +81,34 @@ def test_an_optimizer_goes_on_from_its_state() -> None:
 
     half, state = steps(5)
     assert steps(5, state, half)[0] == steps(10)[0] != steps(5, None, half)[0]
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="a setting of glibc")
+def test_freed_memory_is_kept_and_not_taken_anew_page_by_page() -> None:
+    code = """
+import resource, sys, torch
+from torchrl_bmrl.training import keep_freed_memory
+if sys.argv[1] == "keep":
+    assert keep_freed_memory()
+def faults():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+def work():
+    several = [torch.ones(2**20) for _ in range(8)]  # of 4 MiB
+work()
+before = faults()
+for _ in range(20):
+    work()
+print(faults() - before)
+"""
+    taken = {
+        how: int(
+            subprocess.run(
+                [sys.executable, "-c", code, how], capture_output=True, text=True, check=True
+            ).stdout
+        )
+        for how in ("keep", "leave")
+    }
+    assert taken["keep"] < 100 < taken["leave"]
 
 
 # -- compiled and captured -------------------------------------------------------------------------

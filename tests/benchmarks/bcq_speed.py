@@ -36,7 +36,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from torchrl_bmrl.modules import ActionVAE, make_perturbation_network, make_qvalue_network
 from torchrl_bmrl.objectives import BCQLoss, StackedLoss
-from torchrl_bmrl.training import accelerate, gradient_step, make_adam
+from torchrl_bmrl.training import accelerate, gradient_step, keep_freed_memory, make_adam
 
 OBSERVATION_DIM, ACTION_DIM = 33, 7
 WIDTH = 256
@@ -305,6 +305,7 @@ def main(arguments: list[str] | None = None) -> None:
         parser.add_argument(name, **option)
     args = parser.parse_args(arguments)
     torch.set_num_threads(1)
+    keep_freed_memory()  # as the recipes do
     speeds = {
         str(dtype).removeprefix("torch."): product_speed(dtype, args.device)
         for dtype in (torch.float32, torch.bfloat16)

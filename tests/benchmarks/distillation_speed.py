@@ -24,7 +24,7 @@ from tensordict import TensorDict
 from torchrl_bmrl.agents import Student, make_bcq_loss
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.objectives import MetaDistillationLoss
-from torchrl_bmrl.training import accelerate, gradient_step, make_adam
+from torchrl_bmrl.training import accelerate, gradient_step, keep_freed_memory, make_adam
 
 TASKS, ROWS = 6, 64
 
@@ -93,6 +93,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     args = parser.parse_args(arguments)
     torch.set_num_threads(1)
+    keep_freed_memory()  # as the recipes do
     data = make_data(args.device)
     updates = {name: warmed_up(update, [data]) for name, update in variants(args.device).items()}
     speeds: dict[str, list[float]] = {name: [] for name in updates}
