@@ -22,6 +22,7 @@ from helpers import (
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
+from torch.utils.flop_counter import FlopCounterMode
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
@@ -45,6 +46,7 @@ from torchrl_bmrl.modules import (
     make_task_encoder,
     prototype,
 )
+from torchrl_bmrl.modules.generator import Network, make_mlp
 from torchrl_bmrl.objectives import BCQLoss, DiscreteBCQLoss, PLASLoss
 
 DIMS = (OBSERVATION_DIM, ACTION_DIM)
@@ -604,3 +606,85 @@ def test_a_policy_acts_on_bytes() -> None:
     policy = BCQPolicy(generator.decoder, critic, latent_dim=LATENT_DIM, num_candidates=5)
     pixels = torch.randint(256, (6, OBSERVATION_DIM), dtype=torch.uint8)
     assert act(policy, observation=pixels).shape == (6, ACTION_DIM)
+
+
+# -- what is computed once for all candidates ------------------------------------------------------
+
+
+def a_mlp() -> nn.Module:
+    torch.manual_seed(0)
+    return make_mlp(9, 2, (16, 16)).double()
+
+
+def candidate_inputs(*batch: int, parts: int) -> tuple[list[Tensor], list[Tensor]]:
+    """Inputs of which all but one are a state's, expanded over five candidates, and copies."""
+    torch.manual_seed(1)
+    sizes = {1: (9,), 2: (6, 3), 3: (4, 3, 2)}[parts]
+    own = torch.randn(*batch, 5, sizes[1 % parts], dtype=torch.float64)
+    inputs = [
+        own
+        if i == 1 % parts
+        else torch.randn(*batch, 1, size, dtype=torch.float64).expand(*batch, 5, size)
+        for i, size in enumerate(sizes)
+    ]
+    return inputs, [x.contiguous() for x in inputs]
+
+
+@pytest.mark.parametrize("parts", [2, 3])
+@pytest.mark.parametrize("batch", [(), (4,), (3, 4)])
+def test_a_state_shared_by_its_candidates_gives_the_same_output_and_gradients(
+    batch: tuple[int, ...], parts: int
+) -> None:
+    inputs, copies = candidate_inputs(*batch, parts=parts)
+    results = []
+    for given in (inputs, copies):
+        network = a_mlp()
+        value = network(*given)
+        value.square().sum().backward()
+        results.append([value, *(p.grad for p in network.parameters())])
+    assert results[0][0].shape == (*batch, 5, 2)
+    for ours, expected in zip(*results, strict=True):
+        torch.testing.assert_close(ours, expected, rtol=1e-10, atol=1e-12)
+
+
+def test_a_state_shared_by_its_candidates_enters_the_first_layer_once() -> None:
+    inputs, copies = candidate_inputs(4, parts=2)
+    counts = []
+    for given in (inputs, copies):
+        with FlopCounterMode(display=False) as counter, torch.no_grad():
+            a_mlp()(*given)
+        counts.append(counter.get_total_flops())
+    assert counts[1] - counts[0] == 2 * 4 * (5 - 1) * 6 * 16  # states, candidates, inputs, cells
+
+
+def test_networks_under_vmap_give_what_each_gives_alone() -> None:
+    inputs, _ = candidate_inputs(3, 4, parts=2)
+    network = a_mlp()
+    value = torch.vmap(network)(*inputs)
+    for row, expected in enumerate(value):
+        torch.testing.assert_close(network(*(x[row] for x in inputs)), expected)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (4,), (3, 4)])
+def test_a_network_takes_any_batch(shape: tuple[int, ...]) -> None:
+    x = torch.randn(*shape, 9, dtype=torch.float64)
+    network = a_mlp()
+    expected = nn.Sequential(*network)(x)  # layer by layer
+    torch.testing.assert_close(network(x), expected, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("inplace", [True, False, "empty"])
+def test_a_network_writes_where_a_tensordict_module_does(inplace: bool | str) -> None:
+    data = TensorDict({"x": torch.randn(4, 3)}, [4])
+    linear = nn.Linear(3, 2)
+    options = {"in_keys": ["x"], "out_keys": ["y"], "inplace": inplace}
+    ours, theirs = Network(linear, **options), TensorDictModule(linear, **options)
+    result, expected = ours(data.copy()), theirs(data.copy())
+    assert set(result.keys()) == set(expected.keys())
+    assert result.batch_size == expected.batch_size
+    torch.testing.assert_close(result["y"], expected["y"])
+    torch.testing.assert_close(ours(x=data["x"]), expected["y"])
+    dropped = Network(linear, in_keys=["x"], out_keys=["_"])
+    assert set(dropped(data.copy()).keys()) == {"x"}
+    with pytest.raises(RuntimeError, match="more out_keys than tensors"):
+        Network(linear, in_keys=["x"], out_keys=["y", "z"])(data.copy())

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -18,7 +19,6 @@ from torch.nn.utils import clip_grad_norm_
 from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.objectives import SoftUpdate
 
-from torchrl_bmrl import training
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.objectives import StackedLoss
 from torchrl_bmrl.training import accelerate, gradient_step, load_adam, make_adam
@@ -160,7 +160,7 @@ def distillation_batch(members: int, seed: int) -> TensorDict:
 
 CASES = {
     "bcq": (bcq_update, bcq_batch, 0),
-    "stacked_bcq": (bcq_update, bcq_batch, 2),
+    "stacked_bcq": (partial(bcq_update, deactivate_vmap=False), bcq_batch, 2),
     "distillation": (distillation_update, distillation_batch, 0),
 }
 
@@ -187,6 +187,27 @@ def test_a_compiled_update_is_one_program_and_equals_the_eager_one(
         assert eager.keys() == fast.keys()
         for key, value in eager.items():
             torch.testing.assert_close(fast[key], value, rtol=0, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_what_others_compile_beside_an_update_still_trains() -> None:
+    weight, other = nn.Parameter(torch.ones(1)), nn.Parameter(torch.ones(1))
+    optimizer, theirs = make_adam([weight], lr=LR), torch.optim.Adam([other], lr=LR)
+
+    def update(batch: TensorDict) -> dict[str, Tensor]:
+        gradient_step(optimizer, (weight * batch["x"]).square().sum())
+        return {}
+
+    def usual(batch: TensorDict) -> None:
+        theirs.zero_grad()
+        (other * batch["x"]).square().sum().backward()
+        theirs.step()
+
+    batch = TensorDict({"x": torch.ones(1)}, [])
+    accelerate(update, compiled=True)(batch)
+    torch.compile(usual, backend="eager")(batch)
+    assert weight.item() < 1
+    assert other.item() < 1
 
 
 @pytest.mark.gpu
@@ -277,11 +298,10 @@ def test_without_a_gpu_nothing_is_captured_and_that_is_said(
     assert capsys.readouterr().err == "device=cpu has no CUDA graphs; the updates run without\n"
 
 
-def test_an_error_of_the_update_itself_is_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_of_the_update_itself_is_its_own() -> None:
     def update(batch: TensorDict) -> dict[str, Tensor]:
         raise BMRLError("'action' is missing")
 
-    monkeypatch.setattr(training, "_prepare_compiler", lambda on_gpu: None)
     with pytest.raises(BMRLError, match="'action' is missing"):
         accelerate(update, compiled=True)(TensorDict({}, []))
 

@@ -109,35 +109,69 @@ def gradient_step(optimizer: Adam, loss: Tensor, max_norm: float | None = None) 
     # The fused kernel goes through memory as the parameter lies; vmap's gradients lie otherwise.
     grads = [grad.contiguous() for grad in grads]
     state = [optimizer.state[param] for param in params]
-    steps, rate = [each["step"] for each in state], group["lr"]
-    beta1, beta2 = group["betas"]
-    compiling = torch.compiler.is_compiling()
+    moments = [[each[name] for each in state] for name in ("exp_avg", "exp_avg_sq", "step")]
+    options = {"lr": group["lr"], "eps": group["eps"], "betas": group["betas"]}
     with torch.no_grad():
         if max_norm is not None:
             grads = _clipped(grads, max_norm, loss.ndim)
-        if compiling:
-            # 1 - 0.999 has four digits in float32; the fused kernel counts in float64 as well.
-            counted, rate = [step.double() for step in steps], rate.double()
-            torch._foreach_add_(steps, 1.0)
-        adam(
-            params,
-            grads,
-            [each["exp_avg"] for each in state],
-            [each["exp_avg_sq"] for each in state],
-            [],
-            counted if compiling else steps,
-            # The compiler takes the fused kernel for a black box and the other apart.
-            fused=not compiling,
-            foreach=compiling,
-            capturable=compiling,
-            amsgrad=False,
-            beta1=beta1,
-            beta2=beta2,
-            lr=rate,
-            weight_decay=0.0,
-            eps=group["eps"],
-            maximize=False,
-        )
+        if torch.compiler.is_compiling():
+            _traced_adam(params, grads, *moments, **options)
+        else:
+            _fused_adam(params, grads, *moments, **options)
+
+
+def _fused_adam(
+    params: list[Tensor],
+    grads: list[Tensor],
+    means: list[Tensor],
+    squares: list[Tensor],
+    steps: list[Tensor],
+    *,
+    lr: Tensor,
+    eps: float,
+    betas: tuple[float, float],
+) -> None:
+    """PyTorch's own, in one kernel."""
+    adam(
+        params,
+        grads,
+        means,
+        squares,
+        [],
+        steps,
+        fused=True,
+        amsgrad=False,
+        beta1=betas[0],
+        beta2=betas[1],
+        lr=lr,
+        weight_decay=0.0,
+        eps=eps,
+        maximize=False,
+    )
+
+
+def _traced_adam(
+    params: list[Tensor],
+    grads: list[Tensor],
+    means: list[Tensor],
+    squares: list[Tensor],
+    steps: list[Tensor],
+    *,
+    lr: Tensor,
+    eps: float,
+    betas: tuple[float, float],
+) -> None:
+    """The same, for the compiler to fuse with what is around it; it cannot see into PyTorch's."""
+    torch._foreach_add_(steps, 1.0)
+    # Once, and as the fused kernel in float64: of 1 - 0.999 float32 has four digits.
+    count = steps[0].double()
+    rate = lr.double() / (1.0 - betas[0] ** count)
+    root = (1.0 - betas[1] ** count).rsqrt()
+    for param, grad, mean, square in zip(params, grads, means, squares, strict=True):
+        mean.lerp_(grad, 1.0 - betas[0])
+        square.mul_(betas[1]).addcmul_(grad, grad, value=1.0 - betas[1])
+        scale = square.sqrt() * root.to(param.dtype) + eps
+        param.sub_(rate.to(param.dtype) * mean / scale)
 
 
 def _clipped(grads: list[Tensor], max_norm: float, members: int) -> list[Tensor]:
@@ -156,9 +190,9 @@ def accelerate(
     Where that fails, at the first call or for want of a GPU, one message says why and the update
     runs as it is. The first call takes the time of the compilation, about half a minute.
 
-    Compiling sets options for the whole process: gradients are traced into the program, random
-    numbers are on CPU drawn as eager code draws them, so that the results are equal, and
-    tensordicts are no pytrees any more (as ``tensordict.nn.CudaGraphModule`` has it).
+    On CPU a compiled update draws random numbers as the eager one does, so that their results are
+    equal. Compiling makes tensordicts no pytrees any more in the whole process, as
+    ``tensordict.nn.CudaGraphModule`` does.
 
     Args:
         update: takes a batch, changes parameters in place and returns metrics. It must not look at
@@ -188,20 +222,29 @@ def accelerate(
         return update
     fast = update
     if compiled:
-        _prepare_compiler(on_gpu)
-        fast = torch.compile(update, fullgraph=True)
+        fast = _Compiled(update, on_gpu)
     return _WithFallback(_Captured(fast) if captured else fast, update)
 
 
-def _prepare_compiler(on_gpu: bool) -> None:
-    import torch._dynamo
-    import torch._inductor.config
-    from tensordict.nn.functional_modules import _exclude_td_from_pytree
+class _Compiled:
+    """One compiled program of an update, its gradients in it."""
 
-    torch._dynamo.config.trace_autograd_ops = True
-    torch._inductor.config.fallback_random = not on_gpu
-    # vmap over tensordicts does this at every call, and each would be compiled anew.
-    _exclude_td_from_pytree().set()
+    def __init__(self, update: Update, on_gpu: bool) -> None:
+        import torch._dynamo
+        from tensordict.nn.functional_modules import _exclude_td_from_pytree
+
+        # vmap over tensordicts does this at every call, and each would be compiled anew.
+        _exclude_td_from_pytree().set()
+        self.config = torch._dynamo.config
+        # The compiler's own random numbers are slow on CPU.
+        options: dict[str, Any] = {"fallback_random": not on_gpu}
+        self.update = torch.compile(update, fullgraph=True, options=options)
+
+    def __call__(self, batch: TensorDictBase) -> Metrics:
+        # Not for the whole process: in a function that is compiled in several pieces and calls
+        # backward(), PyTorch 2.13 then leaves the gradients out without a word.
+        with self.config.patch(trace_autograd_ops=True):
+            return self.update(batch)
 
 
 def _say(message: str) -> None:
