@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.objectives import StackedLoss
+from torchrl_bmrl.objectives import OfflineLoss, StackedLoss
 from torchrl_bmrl.training import gradient_step, make_adam
 
 pytestmark = pytest.mark.filterwarnings(NO_UPDATER)
@@ -153,6 +153,23 @@ def test_loss_methods_metrics_and_priorities_are_the_members_own(
         row = batch[i].exclude(priority)
         loss(row)
         torch.testing.assert_close(batch[i][priority], row[priority])
+
+
+@every_offline
+def test_critics_under_vmap_within_a_stack_under_vmap_give_the_same(
+    case: Case, same_noise: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = []
+    for in_sequence in (True, False):  # as on a CPU, as on a GPU
+        monkeypatch.setattr(OfflineLoss, "critics_in_sequence", in_sequence)
+        stack = StackedLoss(members(case), deactivate_vmap=in_sequence)
+        same_noise(0)
+        value, metrics = stack.qvalue_loss(batches(case, 0))
+        value.sum().backward()
+        grads = {i: p.grad for i, p in enumerate(stack.qvalue_network_params.parameters())}
+        results.append({"value": value} | metrics | grads)
+    for key, value in results[0].items():
+        torch.testing.assert_close(results[1][key], value)
 
 
 @vmap_or_loop

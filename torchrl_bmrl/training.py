@@ -222,6 +222,7 @@ def accelerate(
         return update
     fast = update
     if compiled:
+        _say("compiling the updates, which takes about half a minute")
         fast = _Compiled(update, on_gpu)
     return _WithFallback(_Captured(fast) if captured else fast, update)
 

@@ -255,8 +255,7 @@ class OfflineLoss(KeyedLoss):
         if not self._stacked:
             values = self.call("qvalue_network", inputs, target=target, frozen=frozen)
             return output(values, key, network)
-        if self.deactivate_vmap or next(self.parameters()).device.type == "cpu":
-            # On CPU a batched matrix product is slower than one product after the other.
+        if self.critics_in_sequence:
             weights = self.weights("qvalue_network", target=target, frozen=frozen)
             if isinstance(weights, list):
                 each: Any = map(list, zip(*(leaf.unbind(0) for leaf in weights), strict=True))
@@ -272,6 +271,11 @@ class OfflineLoss(KeyedLoss):
         run = _vmap_func(network, (None, 0), randomness=self.vmap_randomness)
         params = getattr(self, f"{'target_' if target else ''}qvalue_network_params")
         return output(run(inputs, params.detach() if frozen else params), key, network)
+
+    @property
+    def critics_in_sequence(self) -> bool:
+        """Whether critics run one after the other: on a CPU that is faster than under vmap."""
+        return self.deactivate_vmap or next(self.parameters()).device.type == "cpu"
 
     def qvalue(
         self, tensordict: TensorDictBase, *, target: bool = False, frozen: bool = False
