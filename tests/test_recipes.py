@@ -445,6 +445,20 @@ def test_a_stack_resumed_equals_one_never_stopped(
     assert contents(tmp_path, "bcq/**/*") == expected
 
 
+def diverging(monkeypatch: pytest.MonkeyPatch, factor: Any) -> list[Any]:
+    """Multiplies the critics' sixth loss by a factor; returns all losses."""
+    import train_bcq
+
+    step, calls = train_bcq.gradient_step, []
+
+    def breaking(optimizer: Any, loss: Any, max_norm: Any) -> None:
+        calls.append(loss)  # the generator's and the critics' in turn
+        step(optimizer, loss * factor if len(calls) == 2 * 6 else loss, max_norm)
+
+    monkeypatch.setattr(train_bcq, "gradient_step", breaking)
+    return calls
+
+
 @pytest.mark.robosuite
 @pytest.mark.slow
 def test_a_member_that_diverges_is_named_and_frozen_and_the_others_go_on(
@@ -460,15 +474,7 @@ def test_a_member_that_diverges_is_named_and_frozen_and_the_others_go_on(
     from torchrl_bmrl.agents import load_bcq_loss
 
     shutil.copytree(finished / "data", tmp_path / "data")
-    step, calls = train_bcq.gradient_step, []
-
-    def breaking(optimizer: Any, loss: Any, max_norm: Any) -> None:
-        calls.append(loss)
-        if len(calls) == 2 * 6:  # the critics' sixth
-            loss = loss * torch.tensor([1.0, float("nan"), 1.0, 1.0])
-        step(optimizer, loss, max_norm)
-
-    monkeypatch.setattr(train_bcq, "gradient_step", breaking)
+    calls = diverging(monkeypatch, torch.tensor([1.0, float("nan"), 1.0, 1.0]))
     for _ in range(2):  # said again when the command is repeated
         with pytest.raises(SystemExit) as caught:
             run(tmp_path, train_bcq.train_all, *STACKED)
@@ -500,13 +506,7 @@ def test_a_single_agent_that_diverges_ends_the_run_with_its_last_checkpoint(
     from torchrl_bmrl.agents import load_bcq_loss
 
     shutil.copytree(finished / "data", tmp_path / "data")
-    step, calls = train_bcq.gradient_step, []
-
-    def breaking(optimizer: Any, loss: Any, max_norm: Any) -> None:
-        calls.append(loss)
-        step(optimizer, loss * (float("nan") if len(calls) == 2 * 6 else 1.0), max_norm)
-
-    monkeypatch.setattr(train_bcq, "gradient_step", breaking)
+    diverging(monkeypatch, float("nan"))
     with pytest.raises(SystemExit):
         run(tmp_path, train_bcq.train_all, "tasks=[lift]")
     assert "error: bcq lift, update 8: loss_qvalue is nan" in capsys.readouterr().err

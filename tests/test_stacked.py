@@ -227,7 +227,9 @@ def test_members_keep_coefficients_of_their_own(
     row = transitions(8)
     same_noise(0)
     values, metrics = stack.generator_loss(torch.stack([row, row]))
-    assert float(values[1] - values[0]) == pytest.approx(0.5 * float(metrics["kl_divergence"][0]))
+    assert float((values[1] - values[0]).detach()) == pytest.approx(
+        0.5 * float(metrics["kl_divergence"][0])
+    )
 
 
 def test_hard_update_copies_every_members_critics() -> None:
@@ -271,12 +273,16 @@ def test_data_with_masks_run_in_a_loop() -> None:
 
 
 def differing(name: str) -> list[LossModule]:
-    first = make_bcq_loss()
+    first, renamed, masked = make_bcq_loss(), make_bcq_loss(), make_bcq_loss()
+    renamed.set_keys(action="move")
+    masked.loss_mask_key = "mask"
     return {
         "none": [],
         "options": [first, make_bcq_loss(num_candidates=3)],
         "perturbation": [first, make_bcq_loss(perturbation=True)],
         "loss": [first, CASES["plas"].make()],
+        "keys": [first, renamed],
+        "mask": [first, masked],
         "itself": [first, first],
     }[name]
 
@@ -288,6 +294,8 @@ def differing(name: str) -> list[LossModule]:
         ("options", "'1' differs from '0'"),
         ("perturbation", "'1' differs from '0'"),
         ("loss", "'1' differs from '0'"),
+        ("keys", "'1' differs from '0'"),
+        ("mask", "'1' differs from '0'"),
         ("itself", "share parameters"),
     ],
 )

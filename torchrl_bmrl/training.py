@@ -109,45 +109,32 @@ def gradient_step(optimizer: Adam, loss: Tensor, max_norm: float | None = None) 
     # The fused kernel goes through memory as the parameter lies; vmap's gradients lie otherwise.
     grads = [grad.contiguous() for grad in grads]
     state = [optimizer.state[param] for param in params]
-    moments = [[each[name] for each in state] for name in ("exp_avg", "exp_avg_sq", "step")]
-    options = {"lr": group["lr"], "eps": group["eps"], "betas": group["betas"]}
+    means, squares, steps = (
+        [each[name] for each in state] for name in ("exp_avg", "exp_avg_sq", "step")
+    )
+    rates = {"lr": group["lr"], "eps": group["eps"]}
+    beta1, beta2 = group["betas"]
     with torch.no_grad():
         if max_norm is not None:
             grads = _clipped(grads, max_norm, loss.ndim)
         if torch.compiler.is_compiling():
-            _traced_adam(params, grads, *moments, **options)
-        else:
-            _fused_adam(params, grads, *moments, **options)
-
-
-def _fused_adam(
-    params: list[Tensor],
-    grads: list[Tensor],
-    means: list[Tensor],
-    squares: list[Tensor],
-    steps: list[Tensor],
-    *,
-    lr: Tensor,
-    eps: float,
-    betas: tuple[float, float],
-) -> None:
-    """PyTorch's own, in one kernel."""
-    adam(
-        params,
-        grads,
-        means,
-        squares,
-        [],
-        steps,
-        fused=True,
-        amsgrad=False,
-        beta1=betas[0],
-        beta2=betas[1],
-        lr=lr,
-        weight_decay=0.0,
-        eps=eps,
-        maximize=False,
-    )
+            _traced_adam(params, grads, means, squares, steps, beta1, beta2, **rates)
+            return
+        adam(
+            params,
+            grads,
+            means,
+            squares,
+            [],
+            steps,
+            fused=True,
+            amsgrad=False,
+            beta1=beta1,
+            beta2=beta2,
+            weight_decay=0.0,
+            maximize=False,
+            **rates,
+        )
 
 
 def _traced_adam(
@@ -156,20 +143,21 @@ def _traced_adam(
     means: list[Tensor],
     squares: list[Tensor],
     steps: list[Tensor],
+    beta1: float,
+    beta2: float,
     *,
     lr: Tensor,
     eps: float,
-    betas: tuple[float, float],
 ) -> None:
-    """The same, for the compiler to fuse with what is around it; it cannot see into PyTorch's."""
+    """The fused kernel's equations; that kernel the compiler cannot join with what is around it."""
     torch._foreach_add_(steps, 1.0)
     # Once, and as the fused kernel in float64: of 1 - 0.999 float32 has four digits.
     count = steps[0].double()
-    rate = lr.double() / (1.0 - betas[0] ** count)
-    root = (1.0 - betas[1] ** count).rsqrt()
+    rate = lr.double() / (1.0 - beta1**count)
+    root = (1.0 - beta2**count).rsqrt()
     for param, grad, mean, square in zip(params, grads, means, squares, strict=True):
-        mean.lerp_(grad, 1.0 - betas[0])
-        square.mul_(betas[1]).addcmul_(grad, grad, value=1.0 - betas[1])
+        mean.lerp_(grad, 1.0 - beta1)
+        square.mul_(beta2).addcmul_(grad, grad, value=1.0 - beta2)
         scale = square.sqrt() * root.to(param.dtype) + eps
         param.sub_(rate.to(param.dtype) * mean / scale)
 

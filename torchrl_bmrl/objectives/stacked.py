@@ -241,16 +241,21 @@ def _join(results: Sequence[Any]) -> Any:
     return first
 
 
+def _kind(loss: LossModule) -> tuple[Any, ...]:
+    """What members of a stack have in common."""
+    return type(loss), kind(loss), loss.tensor_keys, loss.in_keys, loss.loss_mask_key
+
+
 def _check_members(losses: Sequence[LossModule], names: Sequence[str]) -> None:
     if not losses or len(names) != len(losses) or len(set(names)) < len(names):
         raise BMRLError(
             f"{len(losses)} losses named {list(names)}; valid: at least one, each with its own name"
         )
     for name, loss in zip(names, losses, strict=True):
-        if type(loss) is not type(losses[0]) or kind(loss) != kind(losses[0]):
+        if _kind(loss) != _kind(losses[0]):
             raise BMRLError(
-                f"loss {name!r} differs from {names[0]!r} in kind, networks or options; valid: "
-                "equal ones, but for parameters and coefficients"
+                f"loss {name!r} differs from {names[0]!r} in kind, keys, networks or options; "
+                "valid: equal ones, but for parameters and coefficients"
             )
     held = [leaf for loss in losses for part in _state(loss).values() for leaf in _leaves(part)]
     trained = [id(leaf) for leaf in held if leaf.requires_grad]

@@ -1,0 +1,158 @@
+"""The agents of stage 1 as they are trained: one alone, or several as one stacked loss."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+from settings import Config
+from torch import Tensor
+from torchrl.objectives import SoftUpdate
+from tqdm import tqdm
+
+from torchrl_bmrl.agents import make_bcq_loss
+from torchrl_bmrl.checkpoint import load_checkpoint, load_state, save_checkpoint
+from torchrl_bmrl.envs.transforms import ObservationStatistics
+from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.objectives import BCQLoss, StackedLoss
+from torchrl_bmrl.parallel import derive_seed
+from torchrl_bmrl.runs import check_finite
+from torchrl_bmrl.training import get_rng_state, load_adam, make_adam, set_rng_state
+
+LOSS_SETTINGS = (
+    "num_cells",
+    "num_qvalue_nets",
+    "perturbation",
+    "num_candidates",
+    "lmbda",
+    "latent_clip",
+    "kl_weight",
+    "kl_reduction",
+    "gamma",
+    "max_perturbation",
+    "value_bounds",
+    "target_dtype",
+    "loss_function",
+)
+
+
+class Agents:
+    """Agents that are kept under ``bcq/<name>``, several of them as one stacked loss.
+
+    Args:
+        config: the settings.
+        agents: of each agent its name and its task.
+        statistics: of the observations, kept beside the agents.
+    """
+
+    def __init__(
+        self, config: Config, agents: dict[str, str], statistics: ObservationStatistics
+    ) -> None:
+        self.config, self.agents, self.statistics = config, agents, statistics
+        self.folder, self.names = Path(config.run_dir) / "bcq", list(agents)
+        self.options = {option: getattr(config.bcq, option) for option in LOSS_SETTINGS}
+        losses = []
+        for name in self.names:  # an agent starts the same alone and in a stack
+            torch.manual_seed(derive_seed(config.seed, "bcq", name))
+            losses.append(make_bcq_loss(**self.options))
+        if len(losses) == 1:
+            self.loss, self.kind = losses[0], "bcq"
+            self.path = self.checkpoint(self.names[0])
+        else:
+            torch.manual_seed(derive_seed(config.seed, "bcq", *self.names))
+            self.loss, self.kind = StackedLoss(losses, self.names), "bcq stack"
+            self.path = self.folder / "stacked.safetensors"
+        self.loss.to(config.device)
+        networks = ["generator", "qvalue_network"]
+        networks += ["perturbation_network"] if config.bcq.perturbation else []
+        self.optimizers = {  # in update order
+            name.removesuffix("_network"): make_adam(
+                getattr(self.loss, f"{name}_params").parameters(), config.bcq.lr
+            )
+            for name in networks
+        }
+        self.targets = SoftUpdate(self.loss, tau=config.bcq.tau)  # sets them to the critics
+        self.updates = 0
+        self.evaluations: dict[str, list[dict]] = {name: [] for name in self.names}
+        self.diverged: dict[str, str] = {}  # by name, what was not finite
+
+    def checkpoint(self, name: str) -> Path:
+        """Where an agent is kept."""
+        return self.folder / name / "checkpoint.safetensors"
+
+    def agent(self, name: str) -> BCQLoss:
+        """An agent's loss, as it is now."""
+        stacked = isinstance(self.loss, StackedLoss)
+        return self.loss.member(self.names.index(name)) if stacked else self.loss
+
+    @property
+    def well(self) -> list[str]:
+        """Agents that have not diverged."""
+        return [name for name in self.names if name not in self.diverged]
+
+    def finite(self, metrics: dict[str, Tensor], update: int) -> dict[str, dict[str, float]]:
+        """Every agent's metrics; one whose are not finite is said and left as it was kept last."""
+        columns = {key: torch.atleast_1d(value).tolist() for key, value in metrics.items()}
+        rows = {}
+        for name in self.well:
+            i = self.names.index(name)
+            rows[name] = {key: column[i] for key, column in columns.items()}
+            try:
+                check_finite(rows[name], f"bcq {name}, update {update}")
+            except BMRLError as error:
+                self.diverged[name] = str(error)
+                if not self.well:
+                    raise
+                tqdm.write(f"{error}; it is frozen and the others go on", file=sys.stderr)
+                del rows[name]
+        return rows
+
+    def load(self) -> None:
+        """Goes on from what was kept, if anything was."""
+        if not self.path.exists():
+            return
+        state, metadata = load_checkpoint(self.path, kind=self.kind)
+        load_state(self.loss, state["loss"], self.path)
+        for name, optimizer in self.optimizers.items():
+            load_adam(optimizer, state["optimizers"][name])
+        set_rng_state(state["rng"], self.config.device)
+        self.updates = metadata["updates"]
+        if self.kind == "bcq":
+            self.evaluations = {self.names[0]: metadata["evaluations"]}
+        else:
+            self.evaluations, self.diverged = metadata["evaluations"], metadata["diverged"]
+            self.save_agents(self.updates)  # if a kill came in between
+
+    def save(self, update: int) -> None:
+        """Keeps what the training goes on from, and every agent that is well."""
+        state = {
+            "loss": self.loss.state_dict(),
+            "optimizers": {name: o.state_dict() for name, o in self.optimizers.items()},
+            "rng": get_rng_state(self.config.device),
+        }
+        if self.kind == "bcq":
+            return save_checkpoint(self.path, state, self.metadata(self.names[0], update))
+        metadata = {"kind": self.kind, "names": self.names, "updates": update}
+        metadata |= {"evaluations": self.evaluations, "diverged": self.diverged}
+        save_checkpoint(self.path, state, metadata)
+        self.save_agents(update)
+
+    def save_agents(self, update: int) -> None:
+        """Keeps each member of a stack on its own, for those who only read it."""
+        for name in self.well:
+            path, metadata = self.checkpoint(name), self.metadata(name, update)
+            if not path.exists() or load_checkpoint(path, kind="bcq")[1] != metadata:
+                save_checkpoint(path, {"loss": self.agent(name).state_dict()}, metadata)
+
+    def metadata(self, name: str, update: int) -> dict[str, Any]:
+        """What an agent's checkpoint says of it."""
+        return {
+            "kind": "bcq",
+            "task": self.agents[name],
+            "loss": self.options,
+            "updates": update,
+            "evaluations": self.evaluations[name],
+            "statistics": {key: x.tolist() for key, x in vars(self.statistics).items()},
+        }
