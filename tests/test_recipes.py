@@ -436,13 +436,27 @@ def test_a_stack_resumed_equals_one_never_stopped(
     assert member.exists() == (kept is not None)
     if kept is not None:
         assert load_bcq_loss(member)[1]["updates"] == kept
-        member.unlink()  # as if the kill had come before it was written
     counted: list[int] = []
     train_bcq.train_job((config, AGENTS), counted.append)
     assert sum(counted) == 12 * len(AGENTS)
     expected = contents(stacked, "bcq/**/*")
     assert len(expected) == 1 + 2 * len(AGENTS)
     assert contents(tmp_path, "bcq/**/*") == expected
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_a_members_checkpoint_that_a_kill_left_out_is_written_when_the_run_goes_on(
+    run: Run, stacked: Path, tmp_path: Path
+) -> None:
+    import train_bcq
+
+    folder = shutil.copytree(stacked, tmp_path / "run")
+    (folder / "bcq" / "lift" / "checkpoint.safetensors").unlink()
+    before = times(folder)
+    run(folder, train_bcq.train_all, *STACKED)
+    assert contents(folder, "bcq/**/*") == contents(stacked, "bcq/**/*")
+    assert before.items() <= times(folder).items()  # and nothing else
 
 
 def diverging(monkeypatch: pytest.MonkeyPatch, factor: Any) -> list[Any]:

@@ -199,8 +199,9 @@ def test_what_others_compile_beside_an_update_still_trains() -> None:
         return {}
 
     def usual(batch: TensorDict) -> None:
+        loss = (other * batch["x"]).square().sum()
         theirs.zero_grad()
-        (other * batch["x"]).square().sum().backward()
+        loss.backward()
         theirs.step()
 
     batch = TensorDict({"x": torch.ones(1)}, [])
