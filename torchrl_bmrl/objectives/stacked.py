@@ -45,9 +45,13 @@ class StackedLoss(LossModule):
             names that are not one for each; and at a call for data without a row per member.
 
     Example:
-        >>> from torchrl_bmrl.agents import make_bcq_loss
         >>> from torchrl.objectives import SoftUpdate
-        >>> losses = [make_bcq_loss(observation_dim=3, action_dim=2) for _ in range(4)]
+        >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
+        >>> from torchrl_bmrl.objectives import BCQLoss
+        >>> losses = [
+        ...     BCQLoss(ActionVAE(3, 2), make_qvalue_network(3, 2), bounds=(-1.0, 1.0))
+        ...     for _ in range(4)
+        ... ]
         >>> stack = StackedLoss(losses, names=["reach", "lift", "push_left", "push_right"])
         >>> targets = SoftUpdate(stack, tau=0.005)
         >>> data = TensorDict(
