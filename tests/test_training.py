@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import shutil
 import subprocess
@@ -94,21 +95,21 @@ def faults():
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 def work():
     several = [torch.ones(2**20) for _ in range(8)]  # of 4 MiB
-work()
+for _ in range(5):
+    work()
 before = faults()
-for _ in range(20):
+for _ in range(50):
     work()
 print(faults() - before)
 """
+    # By itself glibc sometimes learns to keep blocks of this size; here it hands all of them back.
+    env = {**os.environ, "MALLOC_MMAP_THRESHOLD_": "131072", "MALLOC_TRIM_THRESHOLD_": "131072"}
     taken = {
-        how: int(
-            subprocess.run(
-                [sys.executable, "-c", code, how], capture_output=True, text=True, check=True
-            ).stdout
-        )
+        how: int(subprocess.check_output([sys.executable, "-c", code, how], env=env, text=True))
         for how in ("keep", "leave")
     }
-    assert taken["keep"] < 100 < taken["leave"]
+    # The heap may still grow once, by some of a round's 8,192 pages.
+    assert 5 * taken["keep"] < taken["leave"]
 
 
 # -- compiled and captured -------------------------------------------------------------------------
