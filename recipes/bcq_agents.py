@@ -123,7 +123,10 @@ class Agents:
             self.evaluations = {self.names[0]: metadata["evaluations"]}
         else:
             self.evaluations, self.diverged = metadata["evaluations"], metadata["diverged"]
-            self.save_agents(self.updates)  # if a kill came in between
+            for name in self.well:
+                path = self.checkpoint(name)
+                if not path.exists() or load_checkpoint(path, kind="bcq")[1] != self.metadata(name):
+                    self.save_agent(name)  # a kill came in between
 
     def save(self, update: int) -> None:
         """Keeps what the training goes on from, and every agent that is well."""
@@ -132,27 +135,28 @@ class Agents:
             "optimizers": {name: o.state_dict() for name, o in self.optimizers.items()},
             "rng": get_rng_state(self.config.device),
         }
+        self.updates = update
         if self.kind == "bcq":
-            return save_checkpoint(self.path, state, self.metadata(self.names[0], update))
+            save_checkpoint(self.path, state, self.metadata(self.names[0]))
+            return
         metadata = {"kind": self.kind, "names": self.names, "updates": update}
         metadata |= {"evaluations": self.evaluations, "diverged": self.diverged}
         save_checkpoint(self.path, state, metadata)
-        self.save_agents(update)
-
-    def save_agents(self, update: int) -> None:
-        """Keeps each member of a stack on its own, for those who only read it."""
         for name in self.well:
-            path, metadata = self.checkpoint(name), self.metadata(name, update)
-            if not path.exists() or load_checkpoint(path, kind="bcq")[1] != metadata:
-                save_checkpoint(path, {"loss": self.agent(name).state_dict()}, metadata)
+            self.save_agent(name)
 
-    def metadata(self, name: str, update: int) -> dict[str, Any]:
+    def save_agent(self, name: str) -> None:
+        """Keeps a member of a stack on its own, for those who only read it."""
+        state = {"loss": self.agent(name).state_dict()}
+        save_checkpoint(self.checkpoint(name), state, self.metadata(name))
+
+    def metadata(self, name: str) -> dict[str, Any]:
         """What an agent's checkpoint says of it."""
         return {
             "kind": "bcq",
             "task": self.agents[name],
             "loss": self.options,
-            "updates": update,
+            "updates": self.updates,
             "evaluations": self.evaluations[name],
             "statistics": {key: x.tolist() for key, x in vars(self.statistics).items()},
         }

@@ -255,7 +255,8 @@ class _WithFallback:
                 warnings.simplefilter("ignore")  # what compilers say about tensordict's internals
                 return self.fast(batch)
         except Exception as error:
-            # Nothing has moved: a program that cannot be made does not run in part.
+            # A program that cannot be made has not run in part; what an eager update before a
+            # capture cannot do, the plain one cannot either, and it says so itself.
             reason = str(error).strip().partition("\n")[0]
             _say(f"updates are not accelerated ({type(error).__name__}: {reason}); they run as is")
             self.fast, self.left = self.plain, 0
