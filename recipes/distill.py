@@ -21,13 +21,13 @@ from settings import Config, run_recipe
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_bmrl.agents import Student, load_bcq_loss
+from torchrl_bmrl.agents import Student, load_bcq_loss, make_distillation_loss
 from torchrl_bmrl.checkpoint import load_checkpoint, load_state, save_checkpoint
 from torchrl_bmrl.data import make_multi_task_replay_buffer, with_previous
 from torchrl_bmrl.data.demonstrations import load_transitions, read_statistics
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
-from torchrl_bmrl.objectives import BCQLoss, MetaDistillationLoss
+from torchrl_bmrl.objectives import BCQLoss
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
 from torchrl_bmrl.runs import check_finite, log_metrics, make_logger
 from torchrl_bmrl.training import (
@@ -102,15 +102,9 @@ def train_student(config: Config, report: Report) -> None:
     }
     student = Student(**options)
     normalisation = value_statistics(teachers, train) if settings.normalise_qvalue else (None, None)
-    loss = MetaDistillationLoss(
-        student.task_encoder,
-        student.task_classifier,
-        student.generator,
-        student.qvalue_network,
-        [teacher.decoder for teacher in teachers],
-        [teacher.qvalue_network for teacher in teachers],
-        latent_dim=teachers[0].latent_dim,
-        latent_clip=teachers[0].latent_clip,
+    loss = make_distillation_loss(
+        student,
+        teachers,
         qvalue_loc=normalisation[0],
         qvalue_scale=normalisation[1],
         **{name: getattr(settings, name) for name in LOSS_SETTINGS},

@@ -26,7 +26,7 @@ from torchrl_bmrl.modules import (
     make_task_encoder,
     prototype,
 )
-from torchrl_bmrl.objectives import BCQLoss
+from torchrl_bmrl.objectives import BCQLoss, MetaDistillationLoss
 
 OBSERVATION_DIM, ACTION_DIM = 33, 7
 
@@ -161,6 +161,34 @@ class Student(nn.Module):
         if source == "demonstration":
             return DemonstrationTaskLatent(demonstration, self.task_encoder)
         raise UnknownNameError("latent source", source, LATENT_SOURCES)
+
+
+def make_distillation_loss(
+    student: Student, teachers: Sequence[BCQPolicy], **options: Any
+) -> MetaDistillationLoss:
+    """The loss that distils teachers, one per task, into a student; it trains the student itself.
+
+    Args:
+        student: made for as many tasks as there are teachers.
+        teachers: trained agents, such as :meth:`BCQPolicy.from_loss` gives.
+        **options: of :class:`MetaDistillationLoss`; the latent is the teachers'.
+
+    Example:
+        >>> teachers = [BCQPolicy.from_loss(make_bcq_loss(num_cells=(8,))) for _ in range(2)]
+        >>> make_distillation_loss(Student(num_tasks=2), teachers).num_tasks
+        2
+    """
+    return MetaDistillationLoss(
+        student.task_encoder,
+        student.task_classifier,
+        student.generator,
+        student.qvalue_network,
+        [teacher.decoder for teacher in teachers],
+        [teacher.qvalue_network for teacher in teachers],
+        latent_dim=teachers[0].latent_dim,
+        latent_clip=teachers[0].latent_clip,
+        **options,
+    )
 
 
 LATENT_SOURCES = ("prototype", "online", "demonstration")

@@ -11,13 +11,12 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported
 
-import argparse
 from collections.abc import Callable
 from statistics import median
 from time import perf_counter
 
 import torch
-from bcq_speed import OBSERVATION_DIM, make_pair, wait
+from bcq_speed import OBSERVATION_DIM, make_pair, read_options, wait
 from plain_bcq import PlainBCQ
 from tensordict import TensorDict
 from torch import Tensor
@@ -70,10 +69,7 @@ def measure(states: int, *, rounds: int, device: str) -> dict[str, float]:
 
 def main(arguments: list[str] | None = None) -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--rounds", type=int, default=40)
-    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
-    args = parser.parse_args(arguments)
+    args = read_options(__doc__, arguments)
     torch.set_num_threads(1)
     keep_freed_memory()  # as the recipes do
     print("| States | Way | ms a call | ms a state |\n|---:|---|---:|---:|")

@@ -293,19 +293,28 @@ def product_speed(dtype: torch.dtype, device: str) -> float:
     return 2 * 1000 * WIDTH**2 / min(seconds) / 1e9
 
 
+def read_options(
+    summary: str | None,
+    arguments: list[str] | None,
+    options: dict[str, dict[str, Any]] | None = None,
+) -> argparse.Namespace:
+    """Options of a script, with those that all have."""
+    parser = argparse.ArgumentParser(description=(summary or "").splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=40)
+    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
+    for name, option in (options or {}).items():
+        parser.add_argument(name, **option)
+    return parser.parse_args(arguments)
+
+
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     options: dict[str, dict[str, Any]] = {
-        "--rounds": {"type": int, "default": 40},
         "--updates": {"type": int, "default": 5, "help": "updates per variant and round"},
         "--batch-sizes": {"type": int, "nargs": "+", "default": list(BATCH_SIZES)},
         "--members": {"type": int, "nargs": "*", "default": [6], "help": "sizes of stacks"},
-        "--device": {"choices": ["cpu", "cuda"], "default": "cpu"},
         "--d3rlpy": {"metavar": "PYTHON", "help": "an interpreter that has d3rlpy"},
     }
-    for name, option in options.items():
-        parser.add_argument(name, **option)
-    args = parser.parse_args(arguments)
+    args = read_options(__doc__, arguments, options)
     torch.set_num_threads(1)
     keep_freed_memory()  # as the recipes do
     speeds = {

@@ -11,19 +11,17 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported
 
-import argparse
 from collections.abc import Callable
 from statistics import median
 from time import perf_counter
 from typing import Any
 
 import torch
-from bcq_speed import ACTION_DIM, LR, OBSERVATION_DIM, make_batch, wait, warmed_up
+from bcq_speed import ACTION_DIM, LR, OBSERVATION_DIM, make_batch, read_options, wait, warmed_up
 from tensordict import TensorDict
 
-from torchrl_bmrl.agents import Student, make_bcq_loss
+from torchrl_bmrl.agents import Student, make_bcq_loss, make_distillation_loss
 from torchrl_bmrl.modules import BCQPolicy
-from torchrl_bmrl.objectives import MetaDistillationLoss
 from torchrl_bmrl.training import accelerate, gradient_step, keep_freed_memory, make_adam
 
 TASKS, ROWS = 6, 64
@@ -44,16 +42,7 @@ def make_update(
     losses = [make_bcq_loss(observation_dim=OBSERVATION_DIM, action_dim=ACTION_DIM)] * TASKS
     teachers = [BCQPolicy.from_loss(loss) for loss in losses]
     student = Student(num_tasks=TASKS)
-    loss = MetaDistillationLoss(
-        student.task_encoder,
-        student.task_classifier,
-        student.generator,
-        student.qvalue_network,
-        [teacher.decoder for teacher in teachers],
-        [teacher.qvalue_network for teacher in teachers],
-        latent_dim=teachers[0].latent_dim,
-        deactivate_vmap=in_sequence,
-    ).to(device)
+    loss = make_distillation_loss(student, teachers, deactivate_vmap=in_sequence).to(device)
     ours = make_adam(loss.parameters(), lr=LR)
     theirs = torch.optim.Adam(loss.parameters(), lr=LR)
 
@@ -88,10 +77,7 @@ def variants(device: str) -> dict[str, Callable[[TensorDict], Any]]:
 
 def main(arguments: list[str] | None = None) -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--rounds", type=int, default=40)
-    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
-    args = parser.parse_args(arguments)
+    args = read_options(__doc__, arguments)
     torch.set_num_threads(1)
     keep_freed_memory()  # as the recipes do
     data = make_data(args.device)
