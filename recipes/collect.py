@@ -34,6 +34,7 @@ def collect(config: Config) -> None:
         seed=config.seed,
         workers=config.workers,
         stepper=config.stepper,
+        after=config.collect.after,
     )
     write_statistics(data_dir, config.tasks)
 

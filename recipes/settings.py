@@ -14,7 +14,7 @@ from torchrl_bmrl.agents import LATENT_SOURCES
 from torchrl_bmrl.data.replay import check_device
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.experts.controllers import ExpertGains
-from torchrl_bmrl.names import STEPPERS, TASKS, check_task
+from torchrl_bmrl.names import STEPPERS, TASKS, check_task, composition_stages
 from torchrl_bmrl.objectives.bcq import TARGET_DTYPES
 from torchrl_bmrl.objectives.checks import check_value_bounds
 from torchrl_bmrl.objectives.common import LOSS_FUNCTIONS
@@ -31,6 +31,8 @@ class CollectSettings:
     train_episodes: dict[str, int] = MISSING  # by task
     valid_episodes: int = MISSING  # held out, of each task
     noise: float = 0.2  # standard deviation on every action dimension
+    # By task, what the expert does before an episode begins, in turn: starts as in a composition.
+    after: dict[str, list[str]] = field(default_factory=dict)
     gains: ExpertGains = field(default_factory=ExpertGains)
 
 
@@ -177,6 +179,10 @@ def check_settings(config: Config) -> None:
             f"tasks is {config.tasks}; valid: at least one, each once and with a number in "
             "collect.train_episodes"
         )
+    for task, befores in config.collect.after.items():
+        check_task(task)
+        for before in filter(None, befores):
+            composition_stages(before)
     if not config.evaluate.latent_sources:
         raise ConfigError(f"evaluate.latent_sources is []; valid: some of {list(LATENT_SOURCES)}")
     for source in config.evaluate.latent_sources:

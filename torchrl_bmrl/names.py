@@ -18,6 +18,9 @@ TASKS: tuple[str, ...] = ("reach", "lift", *(f"push_{name}" for name in PUSH_DIR
 HORIZON = 200
 """Steps of an episode; it ends there by truncation, never by termination."""
 
+STAGE_HORIZON = 100
+"""Steps that an episode of a composition has for each of its stages."""
+
 STEPPERS = ("fast", "robosuite")
 """Who advances the simulator; the trajectories are the same to the bit."""
 
@@ -37,11 +40,37 @@ def check_task(task: str) -> str:
     return task
 
 
-def gymnasium_id(task: str) -> str:
-    """Registered gymnasium id of a task.
+def composition_stages(composition: str) -> tuple[str, ...]:
+    """The tasks of a composition, in their order; they are joined by ``-``.
+
+    Raises:
+        UnknownNameError: if one of them is not a task.
 
     Example:
-        >>> gymnasium_id("push_left")
-        'bmrl/SawyerPushLeft-v0'
+        >>> composition_stages("reach-lift-push_left")
+        ('reach', 'lift', 'push_left')
     """
-    return f"bmrl/Sawyer{check_task(task).title().replace('_', '')}-v0"
+    return tuple(check_task(task) for task in composition.split("-"))
+
+
+def horizon_of(task: str) -> int:
+    """Steps of an episode of a task, or of a composition.
+
+    Example:
+        >>> horizon_of("lift"), horizon_of("reach-lift-reach")
+        (200, 300)
+    """
+    stages = composition_stages(task)
+    return HORIZON if len(stages) == 1 else STAGE_HORIZON * len(stages)
+
+
+def gymnasium_id(task: str) -> str:
+    """Registered gymnasium id of a task; all compositions share one, which takes ``task``.
+
+    Example:
+        >>> gymnasium_id("push_left"), gymnasium_id("reach-lift")
+        ('bmrl/SawyerPushLeft-v0', 'bmrl/SawyerComposition-v0')
+    """
+    stages = composition_stages(task)
+    name = "composition" if len(stages) > 1 else task
+    return f"bmrl/Sawyer{name.title().replace('_', '')}-v0"

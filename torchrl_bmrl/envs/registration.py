@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import gymnasium
 
-from torchrl_bmrl.names import HORIZON, TASKS, gymnasium_id
+from torchrl_bmrl.names import TASKS, gymnasium_id, horizon_of
 
 
 def register() -> None:
-    """Registers ``bmrl/SawyerReach-v0`` and its five siblings (idempotent)."""
-    for task in TASKS:
+    """Registers ``bmrl/SawyerReach-v0``, its five siblings and the compositions (idempotent)."""
+    for task in (*TASKS, "reach-lift-reach"):
         if gymnasium_id(task) not in gymnasium.registry:
             gymnasium.register(
                 gymnasium_id(task),
                 entry_point="torchrl_bmrl.envs.sawyer:SawyerEnv",
                 vector_entry_point="torchrl_bmrl.envs.vector:SawyerVectorEnv",
                 # Not gymnasium's TimeLimit: its count is not part of a state that one returns to.
-                kwargs={"task": task, "horizon": HORIZON},
+                kwargs={"task": task, "horizon": horizon_of(task)},
                 disable_env_checker=True,
             )

@@ -32,12 +32,18 @@ class SawyerEnv(gymnasium.Env):
     Action: (7,) in [-1, 1]: position delta (x0.05 m), rotation delta (x0.5 rad), gripper (+1
     closes, -1 opens).
 
-    ``info``: ``success`` and each reward term as ``reward_<term>``.
+    ``info``: ``success``, each reward term as ``reward_<term>`` and ``stage``, the number of the
+    composition's tasks that are done (0 in a task alone).
 
-    An episode never terminates; the registered ids are truncated after 200 steps.
+    In a composition the goal is that of the task at hand, and so is the reward; ``success`` holds
+    from the step on at which the last task succeeds.
+
+    An episode never terminates; the registered ids are truncated after 200 steps, compositions
+    after 100 for each of their tasks.
 
     Args:
-        task: one of :data:`torchrl_bmrl.names.TASKS`.
+        task: one of :data:`torchrl_bmrl.names.TASKS`, or a composition: several joined by ``-``,
+            such as ``"reach-lift-reach"``.
         render_mode: ``None`` or ``"rgb_array"``.
         camera: robosuite camera for :meth:`render`.
         image_size: height and width of the rendered picture [pixels].
@@ -107,6 +113,7 @@ class SawyerEnv(gymnasium.Env):
         # numpy scalars: TorchRL's info reader asks every value for its dtype.
         return {
             "success": np.bool_(self.robosuite_env._check_success()),
+            "stage": np.int64(self.robosuite_env.stage),
             **{f"reward_{name}": np.float64(terms.get(name, 0.0)) for name in REWARD_TERMS},
         }
 
@@ -167,6 +174,7 @@ class SawyerEnv(gymnasium.Env):
         self._fast.step(action)
         env.timestep += 1
         env.cur_time += env.control_timestep
+        env.update_stage()
 
     # -- state ---------------------------------------------------------------------------------
 
@@ -175,7 +183,8 @@ class SawyerEnv(gymnasium.Env):
 
         ``physics``: MuJoCo's integration state (positions, velocities, warm start, controls, time);
         ``gripper`` and ``rest_joints``: what robosuite's gripper and arm controllers remember;
-        ``goal_start``; ``steps`` taken; ``rng``: of the starts to come. ``np.savez`` keeps it.
+        ``goal_start``; in compositions ``stage`` and ``targets``; ``steps`` taken; ``rng``: of the
+        starts to come. ``np.savez`` keeps it.
 
         Exact for Sawyer's own controller and every other that does not interpolate goals.
         """
@@ -188,7 +197,7 @@ class SawyerEnv(gymnasium.Env):
             "physics": physics,
             "gripper": np.array(robot.gripper["right"].current_action, dtype=np.float64),
             "rest_joints": np.array(arm.initial_joint, dtype=np.float64),
-            "goal_start": env.goal_start,
+            **env.episode_state(),
             "steps": np.array([env.timestep]),
             "rng": _rng_to_array(env.rng),
         }
@@ -230,7 +239,7 @@ class SawyerEnv(gymnasium.Env):
         arm.initial_joint = state["rest_joints"].copy()
         # Otherwise robosuite goes on from the pose that it saw last.
         arm.new_update = True
-        env.goal_start = state["goal_start"]
+        env.set_episode_state(state)
         env.timestep = int(state["steps"][0])
         env.cur_time = env.timestep * env.control_timestep
 

@@ -11,14 +11,15 @@ from __future__ import annotations
 
 import logging
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
 
 from torchrl_bmrl.envs.caching import user_numba_cache
-from torchrl_bmrl.errors import UnknownNameError
-from torchrl_bmrl.names import PUSH_DIRECTIONS, TASKS, check_task
+from torchrl_bmrl.errors import BMRLError, UnknownNameError
+from torchrl_bmrl.names import PUSH_DIRECTIONS, TASKS, check_task, composition_stages
 
 # robosuite logs "no private macro file" and controller notes at import and at every construction.
 # A level set before its import is undone by it; a filter stays.
@@ -122,8 +123,8 @@ class _LeanTask(ManipulationTask):
 class _BMRLSawyerTask(ManipulationEnv):
     """What the tasks share: Sawyer, table, goal marker, a start set by inverse kinematics.
 
-    Subclasses place the end-effector, name the goal, and compute reward terms and success. The
-    horizon is not theirs: ``SawyerEnv`` truncates.
+    Subclasses say which of the six tasks is at hand and place the end-effector. The horizon is not
+    theirs: ``SawyerEnv`` truncates.
 
     Args:
         seed: of the starts.
@@ -132,6 +133,10 @@ class _BMRLSawyerTask(ManipulationEnv):
     """
 
     has_cube: ClassVar[bool] = True
+    task: str
+    """The task at hand: it decides goal, reward and success."""
+    stage: int = 0
+    """Tasks of a composition that are done."""
 
     def __init__(self, *, seed: int | None = None, lean: bool = False, **kwargs: Any) -> None:
         self.lean = lean
@@ -246,12 +251,19 @@ class _BMRLSawyerTask(ManipulationEnv):
         robot.gripper["right"].current_action = np.array([-1.0, 1.0])
         self.sim.forward()
 
-    def _place_cube(self) -> np.ndarray:
+    def _above_cube(self) -> np.ndarray:
+        return self.goal_start + np.array([0.0, 0.0, HOVER_HEIGHT])
+
+    def _near_reach_start(self) -> np.ndarray:
+        direction = self.rng.standard_normal(3)
+        radius = REACH_START_RADIUS * self.rng.uniform() ** (1 / 3)
+        return REACH_START + radius * direction / np.linalg.norm(direction)
+
+    def _place_cube(self) -> None:
         xy = self.rng.uniform(-CUBE_RANGE, CUBE_RANGE, size=2)
         position = TABLE_TOP + np.array([xy[0], xy[1], CUBE_HALF_SIZE])
         self.sim.data.set_joint_qpos(self.cube.joints[0], np.append(position, [1.0, 0, 0, 0]))
         self.goal_start = position
-        return position
 
     def _inverse_kinematics(
         self, target: np.ndarray, tolerance: float = 1e-5, iterations: int = 100
@@ -287,6 +299,17 @@ class _BMRLSawyerTask(ManipulationEnv):
 
     # -- state ---------------------------------------------------------------------------------
 
+    def episode_state(self) -> dict[str, np.ndarray]:
+        """What an episode remembers besides the simulator, as arrays."""
+        return {"goal_start": self.goal_start}
+
+    def set_episode_state(self, state: Mapping[str, np.ndarray]) -> None:
+        """Goes back to what :meth:`episode_state` gave."""
+        self.goal_start = state["goal_start"]
+
+    def update_stage(self) -> None:
+        """Called after every action; a task alone has no stages."""
+
     @property
     def goal_start(self) -> np.ndarray:
         """Where the goal was when the episode began, (3,) [m]: the goal marker's place.
@@ -311,13 +334,18 @@ class _BMRLSawyerTask(ManipulationEnv):
 
     @property
     def goal(self) -> np.ndarray:
-        """Goal position (3,) [m]; by default the cube's centre."""
+        """Goal position (3,) [m]: the point to reach, or the cube's centre."""
+        return self.goal_start if self.task == "reach" else self.cube_position
+
+    @property
+    def cube_position(self) -> np.ndarray:
+        """The cube's centre (3,) [m]."""
         return np.array(self.sim.data.body_xpos[self._cube_body_id])
 
     @property
     def cube_displacement(self) -> np.ndarray:
         """Cube's position relative to its start (3,) [m]."""
-        return np.array(self.sim.data.body_xpos[self._cube_body_id]) - self.goal_start
+        return self.cube_position - self.goal_start
 
     @property
     def grasped(self) -> bool:
@@ -348,11 +376,44 @@ class _BMRLSawyerTask(ManipulationEnv):
         # Poses lag the joints by one physics substep; the observation must be a function of the
         # state.
         mujoco.mj_fwdPosition(self.sim.model._model, self.sim.data._data)
+        self.update_stage()
         return super()._post_action(action)
 
     def reward_terms(self) -> dict[str, float]:
-        """The reward's terms by name; the reward is their sum."""
-        return {"reach": reach_reward(float(np.linalg.norm(self.eef_position - self.goal)))}
+        """The reward's terms by name; the reward is their sum.
+
+        All: the end-effector's distance to the goal. Lift: grasp, height. Push: the cube's
+        velocity, its distance from the start.
+        """
+        terms = {"reach": reach_reward(float(np.linalg.norm(self.eef_position - self.goal)))}
+        if self.task == "reach":
+            return terms
+        if self.task == "lift":
+            high = float(self.cube_displacement[2] > LIFT_SUCCESS_HEIGHT)
+            return terms | {"grasp": float(self.grasped), "lift": high}
+        velocity = self.sim.data.qvel[self._cube_dof : self._cube_dof + 3]
+        moved = float(np.linalg.norm(self.cube_displacement))
+        return terms | {
+            "velocity": push_velocity_reward(velocity, self._push_direction),
+            "distance": float(moved > PUSH_SUCCESS_DISTANCE),
+        }
+
+    @property
+    def _push_direction(self) -> np.ndarray:
+        return np.array(PUSH_DIRECTIONS[self.task.removeprefix("push_")])
+
+    def task_success(self) -> bool:
+        """Whether the definition of success of the task at hand holds now."""
+        if self.task == "reach":
+            return bool(np.linalg.norm(self.eef_position - self.goal) < REACH_SUCCESS_DISTANCE)
+        if self.task == "lift":
+            return bool(self.cube_displacement[2] > LIFT_SUCCESS_HEIGHT) and self.grasped
+        along = float(self.cube_displacement @ self._push_direction)
+        sideways = float(np.linalg.norm(self.cube_displacement - along * self._push_direction))
+        return along > PUSH_SUCCESS_DISTANCE and sideways <= PUSH_SUCCESS_DISTANCE / 2
+
+    def _check_success(self) -> bool:
+        return self.task_success()
 
     def reward(self, action: np.ndarray | None = None) -> float:
         """Sum of :meth:`reward_terms`."""
@@ -363,37 +424,21 @@ class BMRLSawyerReach(_BMRLSawyerTask):
     """Bring the end-effector to a random point, from within 1 cm of a set point."""
 
     has_cube = False
+    task = "reach"
 
     def _sample_start(self) -> np.ndarray:
         self.goal_start = self.rng.uniform(REACH_GOAL_LOW, REACH_GOAL_HIGH)
-        direction = self.rng.standard_normal(3)
-        radius = REACH_START_RADIUS * self.rng.uniform() ** (1 / 3)
-        return REACH_START + radius * direction / np.linalg.norm(direction)
-
-    @property
-    def goal(self) -> np.ndarray:
-        """The point to reach (3,) [m]."""
-        return self.goal_start
-
-    def _check_success(self) -> bool:
-        return bool(np.linalg.norm(self.eef_position - self.goal) < REACH_SUCCESS_DISTANCE)
+        return self._near_reach_start()
 
 
 class BMRLSawyerLift(_BMRLSawyerTask):
     """Grasp a randomly placed cube from above and lift it more than 5 cm."""
 
+    task = "lift"
+
     def _sample_start(self) -> np.ndarray:
-        return self._place_cube() + np.array([0.0, 0.0, HOVER_HEIGHT])
-
-    def reward_terms(self) -> dict[str, float]:
-        """Distance to the cube, grasp, height."""
-        return super().reward_terms() | {
-            "grasp": float(self.grasped),
-            "lift": float(self.cube_displacement[2] > LIFT_SUCCESS_HEIGHT),
-        }
-
-    def _check_success(self) -> bool:
-        return bool(self.cube_displacement[2] > LIFT_SUCCESS_HEIGHT) and self.grasped
+        self._place_cube()
+        return self._above_cube()
 
 
 class BMRLSawyerPush(_BMRLSawyerTask):
@@ -406,25 +451,92 @@ class BMRLSawyerPush(_BMRLSawyerTask):
     def __init__(self, direction: str, **kwargs: Any) -> None:
         if direction not in PUSH_DIRECTIONS:
             raise UnknownNameError("push direction", direction, tuple(PUSH_DIRECTIONS))
-        self.direction = np.array(PUSH_DIRECTIONS[direction])
+        self.task = f"push_{direction}"
         super().__init__(**kwargs)
 
     def _sample_start(self) -> np.ndarray:
-        return self._place_cube() + np.array([0.0, 0.0, HOVER_HEIGHT])
+        self._place_cube()
+        return self._above_cube()
 
-    def reward_terms(self) -> dict[str, float]:
-        """Distance to the cube, the cube's velocity, its distance from the start."""
-        velocity = self.sim.data.qvel[self._cube_dof : self._cube_dof + 3]
-        moved = float(np.linalg.norm(self.cube_displacement))
-        return super().reward_terms() | {
-            "velocity": push_velocity_reward(velocity, self.direction),
-            "distance": float(moved > PUSH_SUCCESS_DISTANCE),
-        }
+
+class BMRLSawyerComposition(_BMRLSawyerTask):
+    """Several of the six tasks one after the other, with one cube, in one episode.
+
+    It starts as its first task does. When the task at hand succeeds, the next one begins where the
+    arm and the cube are; goal, reward and success are its own from there on. Reaching means: to
+    above the cube if the next task is one on the cube and the cube lies on the table, else to a
+    random point; a cube that was lifted must then still be in the hand. A push after a lift has to
+    bring the cube back to the table.
+
+    Args:
+        stages: the tasks, in their order.
+
+    Attributes:
+        stage: number of tasks that are done; the last one goes on beyond its success.
+    """
+
+    def __init__(self, stages: Sequence[str], **kwargs: Any) -> None:
+        self.stages = tuple(check_task(task) for task in stages)
+        if not self.stages:
+            raise BMRLError("a composition has no tasks; valid: at least one")
+        self.stage = 0
+        self.targets = np.zeros((len(self.stages), 3))
+        super().__init__(**kwargs)
+
+    @property
+    def task(self) -> str:  # type: ignore[override]
+        """The task at hand."""
+        return self.stages[min(self.stage, len(self.stages) - 1)]
+
+    def _sample_start(self) -> np.ndarray:
+        self.stage = 0
+        self._place_cube()
+        self.targets = self.rng.uniform(REACH_GOAL_LOW, REACH_GOAL_HIGH, self.targets.shape)
+        start = self._near_reach_start() if self.task == "reach" else self._above_cube()
+        self.sim.forward()
+        self._begin_stage()
+        return start
+
+    def _begin_stage(self) -> None:
+        """Sets what the stage's task measures from: the point to reach, or the cube's place."""
+        on_table = self.cube_position
+        on_table[2] = TABLE_TOP[2] + CUBE_HALF_SIZE
+        self.goal_start = on_table
+        if self.task == "reach":
+            following = self.stages[self.stage + 1 : self.stage + 2]
+            to_cube = following not in ((), ("reach",)) and not self.carrying
+            self.goal_start = self._above_cube() if to_cube else self.targets[self.stage]
+
+    @property
+    def carrying(self) -> bool:
+        """Whether the cube has to be in the hand: it was lifted, and not pushed since."""
+        moved = [task for task in self.stages[: self.stage] if task != "reach"]
+        return self.task == "reach" and moved[-1:] == ["lift"]
+
+    def task_success(self) -> bool:
+        """Whether the task at hand succeeds now; a cube that is carried must not be lost."""
+        return super().task_success() and (self.grasped or not self.carrying)
+
+    def update_stage(self) -> None:
+        """Goes on to the next task if the one at hand succeeds."""
+        if self.stage < len(self.stages) and self.task_success():
+            self.stage += 1
+            if self.stage < len(self.stages):
+                self._begin_stage()
 
     def _check_success(self) -> bool:
-        along = float(self.cube_displacement @ self.direction)
-        sideways = float(np.linalg.norm(self.cube_displacement - along * self.direction))
-        return along > PUSH_SUCCESS_DISTANCE and sideways <= PUSH_SUCCESS_DISTANCE / 2
+        return self.stage == len(self.stages)
+
+    def episode_state(self) -> dict[str, np.ndarray]:
+        """Besides the base's, ``stage`` (1,) and the random points to reach, ``targets``."""
+        stage = np.array([self.stage])
+        return super().episode_state() | {"stage": stage, "targets": self.targets.copy()}
+
+    def set_episode_state(self, state: Mapping[str, np.ndarray]) -> None:
+        """Goes back to what :meth:`episode_state` gave."""
+        super().set_episode_state(state)
+        self.stage = int(state["stage"][0])
+        self.targets = state["targets"].copy()
 
 
 REWARD_TERMS = ("reach", "grasp", "lift", "velocity", "distance")
@@ -432,16 +544,18 @@ REWARD_TERMS = ("reach", "grasp", "lift", "velocity", "distance")
 
 
 def make_robosuite_env(task: str, **kwargs: Any) -> _BMRLSawyerTask:
-    """robosuite environment of one of the six tasks.
+    """robosuite environment of one of the six tasks, or of a composition.
 
     Args:
-        task: one of :data:`torchrl_bmrl.names.TASKS`.
+        task: one of :data:`torchrl_bmrl.names.TASKS`, or several joined by ``-``.
         **kwargs: robosuite's own options (``seed``, ``use_object_obs``, cameras, ...).
 
     Raises:
         UnknownNameError: for a name that is not a task.
     """
-    check_task(task)
+    stages = composition_stages(task)
+    if len(stages) > 1:
+        return BMRLSawyerComposition(stages, **kwargs)
     if task == "reach":
         return BMRLSawyerReach(**kwargs)
     if task == "lift":
@@ -451,8 +565,13 @@ def make_robosuite_env(task: str, **kwargs: Any) -> _BMRLSawyerTask:
 
 def robosuite_metadata(task: str) -> dict[str, Any]:
     """robomimic's ``env_args``: what rebuilds the environment of a task with ``robosuite.make``."""
-    kwargs = {} if task in ("reach", "lift") else {"direction": task.removeprefix("push_")}
+    stages = composition_stages(task)
+    kwargs: dict[str, Any] = {}
     name = {"reach": "BMRLSawyerReach", "lift": "BMRLSawyerLift"}.get(task, "BMRLSawyerPush")
+    if len(stages) > 1:
+        name, kwargs = "BMRLSawyerComposition", {"stages": list(stages)}
+    elif name == "BMRLSawyerPush":
+        kwargs = {"direction": task.removeprefix("push_")}
     return {
         "env_name": name,
         "type": 1,
@@ -465,6 +584,7 @@ __all__ = [
     "CONTROL_FREQUENCY",
     "REWARD_TERMS",
     "TASKS",
+    "BMRLSawyerComposition",
     "BMRLSawyerLift",
     "BMRLSawyerPush",
     "BMRLSawyerReach",

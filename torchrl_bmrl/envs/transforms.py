@@ -21,7 +21,7 @@ from torchrl.envs.transforms import (
     Transform,
 )
 
-from torchrl_bmrl.names import gymnasium_id
+from torchrl_bmrl.names import composition_stages, gymnasium_id, horizon_of
 
 OBSERVATION_PARTS = (
     "sin_joint_pos",
@@ -145,10 +145,11 @@ def make_env(
 ) -> TransformedEnv:
     """One task as a TorchRL environment with ``observation (33,)``.
 
-    ``success`` and each reward term, ``reward_<term>``, are read from ``info`` into the tensordict.
+    ``success``, ``stage`` and each reward term, ``reward_<term>``, are read from ``info`` into the
+    tensordict.
 
     Args:
-        task: one of the six.
+        task: one of the six, or a composition: several joined by ``-``.
         statistics: of the normalisation.
         *transforms: appended, such as a source of ``task_latent``.
         num_envs: batch size ``[num_envs]``: episodes in one simulator, for a policy that acts in
@@ -165,16 +166,19 @@ def make_env(
     from torchrl_bmrl.envs.tasks import REWARD_TERMS
 
     name = f"torchrl_bmrl.envs:{gymnasium_id(task)}"
+    if len(composition_stages(task)) > 1:  # these share one id
+        kwargs = {"task": task, "horizon": horizon_of(task)} | kwargs
     env = (
         GymEnv(name, **kwargs)
         if num_envs is None
         else GymWrapper(gymnasium.make_vec(name, num_envs, **kwargs))
     )
     shape = env.batch_size
-    keys = ["success", *(f"reward_{name}" for name in REWARD_TERMS)]
+    keys = ["success", "stage", *(f"reward_{name}" for name in REWARD_TERMS)]
     spec = Composite(
         success=Unbounded(shape, dtype=torch.bool),
-        **{key: Unbounded(shape, dtype=torch.float64) for key in keys[1:]},
+        stage=Unbounded(shape, dtype=torch.int64),
+        **{key: Unbounded(shape, dtype=torch.float64) for key in keys[2:]},
         shape=shape,
     )
     env.set_info_dict_reader(default_info_dict_reader(keys, spec=spec))

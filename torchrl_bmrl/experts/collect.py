@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,9 +18,15 @@ from torchrl_bmrl.data.robomimic import (
 )
 from torchrl_bmrl.envs.sawyer import SawyerEnv
 from torchrl_bmrl.envs.tasks import robosuite_metadata
-from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.experts.controllers import ExpertGains, make_expert
-from torchrl_bmrl.names import HORIZON, TASKS, check_task
+from torchrl_bmrl.names import (
+    STAGE_HORIZON,
+    TASKS,
+    check_task,
+    composition_stages,
+    horizon_of,
+)
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
 
 
@@ -34,6 +41,7 @@ class EpisodeJob:
         path: where the episode is kept.
         gains: of the expert.
         stepper: of :class:`~torchrl_bmrl.envs.sawyer.SawyerEnv`.
+        after: tasks that the expert does before, joined by ``-``.
     """
 
     task: str
@@ -42,6 +50,7 @@ class EpisodeJob:
     path: Path
     gains: ExpertGains = field(default_factory=ExpertGains)
     stepper: str = "fast"
+    after: str = ""
 
 
 _kept: SawyerEnv | None = None
@@ -58,48 +67,89 @@ def _env(task: str, stepper: str) -> SawyerEnv:
 
 
 def collect_episode(
-    task: str, seed: int, *, noise: float, gains: ExpertGains, stepper: str = "fast"
+    task: str,
+    seed: int,
+    *,
+    noise: float,
+    gains: ExpertGains,
+    stepper: str = "fast",
+    after: str = "",
 ) -> Episode:
-    """One episode of the expert of ``task``, 200 steps, reproduced by ``seed``."""
-    env = _env(task, stepper)
-    observation, _ = env.reset(seed=seed)
-    expert = make_expert(task, env.robosuite_env, gains)
+    """One episode of the expert, reproduced by ``seed``.
+
+    Args:
+        task: one of the six (200 steps), or a composition (100 steps for each of its tasks).
+        seed: decides start and noise.
+        noise: standard deviation of the Gaussian noise on each action dimension.
+        gains: of the expert.
+        stepper: of :class:`~torchrl_bmrl.envs.sawyer.SawyerEnv`.
+        after: tasks that the expert does before, joined by ``-``: the episode begins where the last
+            of them succeeded, with arm, gripper and cube as they are then. Empty: where the task
+            itself begins.
+    """
+    env = _env(f"{after}-{task}" if after else task, stepper)
+    scene = env.robosuite_env
     rng = np.random.default_rng(derive_seed(seed, "action noise"))
-    observations = {name: [part] for name, part in observation.items()}
-    model_file = env.robosuite_env.scene_xml()
-    actions, rewards, successes, phases, states = [], [], [], [], []
-    for _ in range(HORIZON):
+
+    def act() -> np.ndarray:
         # What is stored is what was executed, to the bit.
-        noisy = expert() + noise * rng.standard_normal(7)
-        action = np.clip(noisy, -1.0, 1.0).astype(np.float32)
+        return np.clip(expert() + noise * rng.standard_normal(7), -1.0, 1.0).astype(np.float32)
+
+    before = len(composition_stages(after)) if after else 0
+    for attempt in range(100):
+        observation, _ = env.reset(seed=derive_seed(seed, "again", attempt) if attempt else seed)
+        expert = make_expert(env.task, scene, gains)
+        while scene.stage < before and scene.timestep < STAGE_HORIZON * before:
+            observation, *_ = env.step(act())
+        if scene.stage == before:
+            break
+    else:
+        raise BMRLError(f"the expert never came to {task} after {after}; valid: what it can do")
+    observations = {name: [part] for name, part in observation.items()}
+    model_file = scene.scene_xml()
+    actions, rewards, successes, phases, states, stages = [], [], [], [], [], []
+    for _ in range(horizon_of(task)):
+        action = act()
         phases.append(expert.phase)
-        states.append(env.robosuite_env.sim.get_state().flatten())
+        states.append(scene.sim.get_state().flatten())
+        stages.append(scene.stage - before)
         observation, reward, _, _, info = env.step(action)
         for name, part in observation.items():
             observations[name].append(part)
         actions.append(action)
         rewards.append(reward)
-        successes.append(info["success"])
+        successes.append(scene.task_success() if after else info["success"])
     parts = {name: np.stack(rows) for name, rows in observations.items()}
     return Episode(
         observations={name: part[:-1] for name, part in parts.items()},
         next_observations={name: part[1:] for name, part in parts.items()},
         actions=np.stack(actions),
         rewards=np.array(rewards),
-        terminated=np.zeros(HORIZON, dtype=bool),
+        terminated=np.zeros(len(actions), dtype=bool),
         extras={
             "successes": np.array(successes),
             "phases": np.array(phases, dtype=np.int8),
             "states": np.stack(states),
+            **({"stages": np.array(stages, dtype=np.int8)} if "-" in task else {}),
         },
         # robomimic plays states back in the model of the demonstration.
-        attributes={"seed": seed, "phase_names": list(expert.phases), "model_file": model_file},
+        attributes={
+            "seed": seed,
+            "phase_names": list(expert.phases),
+            "model_file": model_file,
+            **({"after": after} if after else {}),
+        },
     )
 
 
 def _collect_job(job: EpisodeJob, report: Report) -> None:
     episode = collect_episode(
-        job.task, job.seed, noise=job.noise, gains=job.gains, stepper=job.stepper
+        job.task,
+        job.seed,
+        noise=job.noise,
+        gains=job.gains,
+        stepper=job.stepper,
+        after=job.after,
     )
     keep_episode(job.path, episode)
     report(1)
@@ -115,6 +165,7 @@ def collect_demonstrations(
     workers: int,
     gains: ExpertGains | None = None,
     stepper: str = "fast",
+    after: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, Path]:
     """Collects demonstrations, one robomimic-layout HDF5 file per task.
 
@@ -130,6 +181,8 @@ def collect_demonstrations(
         workers: processes.
         gains: of the experts.
         stepper: of :class:`~torchrl_bmrl.envs.sawyer.SawyerEnv`; the episodes are the same.
+        after: by task, what the expert does before an episode of it begins
+            (:func:`collect_episode`); the episodes of a task take the entries in turn.
 
     Returns:
         the file of each task.
@@ -140,6 +193,7 @@ def collect_demonstrations(
     """
     gains = gains or ExpertGains()
     files = {check_task(task): directory / f"{task}.hdf5" for task in episodes}
+    afters = {task: list((after or {}).get(task, ())) or [""] for task in files}
     counts = {task: number + valid_episodes for task, number in episodes.items()}
     parts = {
         task: [directory / ".episodes" / task / f"{i:05d}.npz" for i in range(counts[task])]
@@ -154,11 +208,13 @@ def collect_demonstrations(
             path=path,
             gains=gains,
             stepper=stepper,
+            after=afters[task][i % len(afters[task])],
         )
         for task in sorted(parts, key=TASKS.index)
         for i, path in enumerate(parts[task])
         if not path.exists()
     ]
+    jobs.sort(key=lambda job: (TASKS.index(job.task), job.after))  # a worker keeps its last scene
     run_jobs(
         _collect_job,
         jobs,

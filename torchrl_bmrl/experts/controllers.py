@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from torchrl_bmrl.names import PUSH_DIRECTIONS, check_task
+from torchrl_bmrl.names import PUSH_DIRECTIONS, composition_stages
 
 if TYPE_CHECKING:
-    from torchrl_bmrl.envs.tasks import _BMRLSawyerTask
+    from torchrl_bmrl.envs.tasks import BMRLSawyerComposition, _BMRLSawyerTask
 
 POSITION_SCALE = 0.05
 """Metres that an action of 1 asks for."""
@@ -91,12 +91,19 @@ class Expert:
 
 
 class ReachExpert(Expert):
-    """Straight to the goal, gripper open."""
+    """Straight to the goal, the gripper open or closed as it was at the start."""
 
     phases = ("reach",)
 
+    def reset(self) -> None:
+        """Starts over; keeps what the gripper does now."""
+        super().reset()
+        # The first finger's command goes up while the gripper closes.
+        closing = self.env.robots[0].gripper["right"].current_action[0] > 0
+        self._gripper = CLOSE if closing else OPEN
+
     def _target(self) -> tuple[np.ndarray, float, float]:
-        return self.env.goal, OPEN, self.gains.speed_limit
+        return self.env.goal, self._gripper, self.gains.speed_limit
 
 
 class LiftExpert(Expert):
@@ -138,13 +145,15 @@ class LiftExpert(Expert):
 class PushExpert(Expert):
     """Go beside the cube with the gripper closed, come down, push it over the line.
 
+    A cube that is in the hand is first brought down to the table and let go.
+
     Args:
         env: the robosuite environment to control.
         gains: gains and limits.
         direction: unit vector to push along, (3,).
     """
 
-    phases = ("approach", "contact", "push")
+    phases = ("approach", "contact", "push", "release")
     stand_off: ClassVar[float] = 0.055
     """Distance behind the cube's centre at which the gripper comes down [m]."""
 
@@ -154,12 +163,35 @@ class PushExpert(Expert):
         self._direction = np.array(direction)
         super().__init__(env, gains)
 
+    def reset(self) -> None:
+        """Starts over, by letting go of the cube if it is in the hand."""
+        super().reset()
+        self.phase = 3 if self.env.grasped else 0
+
+    def _release(self) -> tuple[np.ndarray, float, float] | None:
+        """Down to the table, open, and up again; ``None`` once the hand is clear of the cube."""
+        cube, eef = self.env.goal, self.env.eef_position
+        limit = self.gains.contact_speed_limit
+        height, up = cube[2] - self.env.goal_start[2], np.array([0.0, 0.0, 1.0])
+        if self.env.grasped and height > 0.003:
+            return eef - max(0.02, height) * up, CLOSE, limit
+        left, right = self.env.named_observation()["robot0_gripper_qpos"]
+        if left - right < 0.02 and eef[2] - cube[2] < 0.03:
+            return eef.copy(), OPEN, limit  # opens around the cube before it leaves
+        if eef[2] - cube[2] < 0.06:
+            return eef + 0.05 * up, OPEN, limit
+        return None
+
     def _target(self) -> tuple[np.ndarray, float, float]:
         cube, eef, along = self.env.goal, self.env.eef_position, self._direction
         behind = cube - self.stand_off * along
         offset = eef - behind
         height, horizontal = offset[2], np.linalg.norm(offset[:2])
         sideways = np.linalg.norm(offset[:2] - (offset @ along) * along[:2])
+        if self.phase == 3:
+            if (target := self._release()) is not None:
+                return target
+            self.phase = 0
         if self.phase == 2 and (sideways > 0.045 or height > 0.05):
             self.phase = 0  # the cube slipped away
         if self.phase == 0 and horizontal < 0.02:
@@ -184,14 +216,52 @@ class PushExpert(Expert):
         return cube + ahead * along, CLOSE, self.gains.contact_speed_limit
 
 
-def make_expert(task: str, env: _BMRLSawyerTask, gains: ExpertGains | None = None) -> Expert:
-    """Scripted expert for a task's robosuite environment.
+class ComposedExpert:
+    """The experts of a composition's tasks, each from where the one before it succeeded.
+
+    Args:
+        env: the robosuite environment to control.
+        gains: gains and limits.
+    """
+
+    def __init__(self, env: BMRLSawyerComposition, gains: ExpertGains | None = None) -> None:
+        self.env = env
+        self.gains = gains
+        self.reset()
+
+    def reset(self) -> None:
+        """Starts over; call after every reset of the environment."""
+        self._stage = self.env.stage
+        self.expert = make_expert(self.env.task, self.env, self.gains)
+
+    @property
+    def phases(self) -> tuple[str, ...]:
+        """The present expert's phases."""
+        return self.expert.phases
+
+    @property
+    def phase(self) -> int:
+        """The present expert's phase."""
+        return self.expert.phase
+
+    def __call__(self) -> np.ndarray:
+        """Noise-free action (7,) in [-1, 1] for the environment's present state."""
+        if self.env.stage not in (self._stage, len(self.env.stages)):
+            self.reset()
+        return self.expert()
+
+
+def make_expert(
+    task: str, env: _BMRLSawyerTask, gains: ExpertGains | None = None
+) -> Expert | ComposedExpert:
+    """Scripted expert for a task's robosuite environment, or for a composition's.
 
     Raises:
         UnknownNameError: for a name that is not a task.
     """
     gains = gains or ExpertGains()
-    check_task(task)
+    if len(composition_stages(task)) > 1:
+        return ComposedExpert(env, gains)
     if task == "reach":
         return ReachExpert(env, gains)
     if task == "lift":
