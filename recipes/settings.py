@@ -111,6 +111,18 @@ class HumanSettings:
 
 
 @dataclass
+class ImitateSettings:
+    """One demonstration of a composition drives the distilled policy (imitate.py)."""
+
+    composition: str = "reach-lift-reach"
+    demonstrations: int = 5  # each alone drives its share of the episodes
+    episodes: int = 50  # of each method and perturbation
+    magnitude: tuple[float, float] = (0.5, 1.5)  # factor of the perturbed motion
+    max_angle: float = 45.0  # tilt of its direction [degrees]
+    cloning_updates: int = 2000  # of behaviour cloning on the demonstration
+
+
+@dataclass
 class Config:
     """Everything that decides a run; ``config.yaml`` in the run folder is one of these."""
 
@@ -130,6 +142,7 @@ class Config:
     distill: DistillSettings = field(default_factory=DistillSettings)
     evaluate: EvaluateSettings = field(default_factory=EvaluateSettings)
     human: HumanSettings = field(default_factory=HumanSettings)
+    imitate: ImitateSettings = field(default_factory=ImitateSettings)
 
 
 POSITIVE = (
@@ -153,6 +166,9 @@ POSITIVE = (
     "evaluate.num_candidates",
     "human.training_seeds",
     "human.tracking",
+    "imitate.demonstrations",
+    "imitate.episodes",
+    "imitate.cloning_updates",
 )
 CHOICES = {
     "logger": LOGGERS,
@@ -204,6 +220,12 @@ def check_settings(config: Config) -> None:
     for key in ("bcq.critic_grad_clip", "bcq.latent_clip"):
         if (value := OmegaConf.select(settings, key)) is not None and value <= 0:
             raise ConfigError(f"{key} is {value}; valid: above 0, or null")
+    composition_stages(config.imitate.composition)
+    if config.imitate.episodes % config.imitate.demonstrations:
+        raise ConfigError(
+            f"imitate.episodes is {config.imitate.episodes}; valid: a multiple of "
+            f"imitate.demonstrations ({config.imitate.demonstrations})"
+        )
     check_device(config.device)
     check_value_bounds(config.bcq.value_bounds)
     for term in config.distill.encoder_terms:

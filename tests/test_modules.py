@@ -516,7 +516,7 @@ def test_sources_hold_copies_without_gradients(encoder: TensorDictModule) -> Non
 
 
 def test_an_unknown_alignment_is_refused_with_the_valid_ones(encoder: TensorDictModule) -> None:
-    with pytest.raises(BMRLError, match="'phase'; valid: time, state"):
+    with pytest.raises(BMRLError, match="'phase'; valid alignments: time, state, progress"):
         DemonstrationTaskLatent(demonstration(), encoder, alignment="phase")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,7 @@ from torchrl.envs.transforms import (
     Transform,
 )
 
+from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.names import composition_stages, gymnasium_id, horizon_of
 
 OBSERVATION_PARTS = (
@@ -74,6 +76,96 @@ class SinCosTransform(Transform):
         for key in self.out_keys:
             observation_spec[key] = Unbounded(spec.shape, dtype=spec.dtype, device=spec.device)
         return observation_spec
+
+
+class PerturbAction(Transform):
+    """Executes other motions than the policy asks for; ``action`` in the data stays the policy's.
+
+    The motion (position and rotation delta) is scaled, the direction of the position delta is
+    tilted, and the result clipped to [-1, 1]. The gripper's command is left alone. The draws are
+    uniform, from PyTorch's global random state.
+
+    Args:
+        magnitude: range of the factor.
+        max_angle: largest angle of the tilt [degrees].
+        per: ``"step"`` draws anew for every action, ``"episode"`` once at a reset, as for a robot
+            that is calibrated badly.
+
+    Raises:
+        BMRLError: if the range is empty or negative, the angle not in [0, 180], or ``per`` another
+            word.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> transform = PerturbAction(magnitude=(0.5, 0.5))
+        >>> transform.inv(TensorDict({"action": torch.ones(7)}))["action"]
+        tensor([0.5000, 0.5000, 0.5000, 0.5000, 0.5000, 0.5000, 1.0000])
+    """
+
+    def __init__(
+        self,
+        *,
+        magnitude: tuple[float, float] = (1.0, 1.0),
+        max_angle: float = 0.0,
+        per: str = "step",
+    ) -> None:
+        if not 0 <= magnitude[0] <= magnitude[1]:
+            raise BMRLError(f"magnitude is {magnitude}; valid: two rising numbers of at least 0")
+        if not 0 <= max_angle <= 180:
+            raise BMRLError(f"max_angle is {max_angle}; valid: between 0 and 180 degrees")
+        if per not in ("step", "episode"):
+            raise UnknownNameError("per", per, ("step", "episode"))
+        super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
+        self.magnitude = magnitude
+        self.max_angle = math.radians(max_angle)
+        self.per = per
+        self._drawn: tuple[Tensor, Tensor, Tensor] | None = None
+
+    def _draw(self, shape: torch.Size) -> tuple[Tensor, Tensor, Tensor]:
+        low, high = self.magnitude
+        factor = low + (high - low) * torch.rand(*shape, 1)
+        return factor, self.max_angle * torch.rand(*shape, 1), torch.randn(*shape, 3)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        if self.per == "episode":
+            drawn = self._draw(tensordict_reset.batch_size)
+            mask = None if tensordict is None else tensordict.get("_reset", None)
+            if self._drawn is not None and mask is not None:
+                anew = mask.reshape(*tensordict_reset.batch_size, 1)
+                pairs = zip(drawn, self._drawn, strict=True)
+                drawn = tuple(torch.where(anew, new, old) for new, old in pairs)  # type: ignore[assignment]
+            self._drawn = drawn
+        return tensordict_reset
+
+    def _inv_apply_transform(self, action: Tensor) -> Tensor:
+        drawn = self._draw(action.shape[:-1]) if self._drawn is None else self._drawn
+        factor, angle, towards = drawn
+        motion, turn, gripper = action.split((3, 3, action.shape[-1] - 6), -1)
+        moved = tilt(motion, towards.to(action), angle.to(action))
+        perturbed = torch.cat([factor * moved, factor * turn], -1).clamp(-1.0, 1.0)
+        return torch.cat([perturbed.to(action), gripper], -1)
+
+
+def tilt(vector: Tensor, towards: Tensor, angle: Tensor) -> Tensor:
+    """Turns vectors by an angle towards other ones; their lengths stay.
+
+    Args:
+        vector: ``(*B, 3)``.
+        towards: ``(*B, 3)``; not parallel to ``vector``.
+        angle: ``(*B, 1)`` [rad].
+
+    Example:
+        >>> x, y = torch.eye(3)[:2]
+        >>> tilt(2 * x, x + y, torch.tensor([torch.pi / 2])).round(decimals=4).abs()
+        tensor([0., 2., 0.])
+    """
+    length = vector.norm(dim=-1, keepdim=True)
+    unit = vector / length.clamp_min(1e-12)
+    across = towards - (towards * unit).sum(-1, keepdim=True) * unit
+    across = across / across.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+    return length * (angle.cos() * unit + angle.sin() * across)
 
 
 @dataclass(frozen=True)

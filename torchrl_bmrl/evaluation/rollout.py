@@ -21,10 +21,12 @@ class EpisodeOutcome:
     Attributes:
         episode_return: sum of rewards over the horizon.
         success: whether the task's definition held at some step (robomimic's convention).
+        stages: tasks of a composition that were done.
     """
 
     episode_return: float
     success: bool
+    stages: int = 0
 
 
 def rollout_episodes(
@@ -104,8 +106,7 @@ def evaluate_policy(
         )
         returns = after.get("reward").double().sum((-2, -1)).reshape(-1)
         successes = after.get("success").any(-1).reshape(-1)
-        outcomes += [
-            EpisodeOutcome(episode_return, success)
-            for episode_return, success in zip(returns.tolist(), successes.tolist(), strict=True)
-        ]
+        stages = after.get("stage", torch.zeros_like(successes)).reshape(len(part), -1).amax(-1)
+        rows = zip(returns.tolist(), successes.tolist(), stages.tolist(), strict=True)
+        outcomes += [EpisodeOutcome(*row) for row in rows]
     return outcomes

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
-from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.modules.generator import Network, make_mlp
 
 TRANSITION_KEYS = ("observation", "action", ("next", "reward"), ("next", "observation"))
@@ -124,6 +124,18 @@ class PrototypeTaskLatent(Transform):
         return observation_spec
 
 
+def last_transition(tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDict:
+    """What the encoder reads, of the step that an environment has just taken."""
+    return TensorDict(
+        {
+            "observation": tensordict.get("observation"),
+            "action": tensordict.get("action"),
+            "next": next_tensordict.select("observation", "reward"),
+        },
+        batch_size=tensordict.batch_size,
+    )
+
+
 class OnlineTaskLatent(PrototypeTaskLatent):
     """Writes the embedding of the last transition; the prototype at the first step.
 
@@ -138,73 +150,148 @@ class OnlineTaskLatent(PrototypeTaskLatent):
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        transition = TensorDict(
-            {
-                "observation": tensordict.get("observation"),
-                "action": tensordict.get("action"),
-                "next": next_tensordict.select("observation", "reward"),
-            },
-            batch_size=tensordict.batch_size,
-        )
-        return next_tensordict.set("task_latent", self.encoder(transition).get("task_latent"))
+        encoded = self.encoder(last_transition(tensordict, next_tensordict))
+        return next_tensordict.set("task_latent", encoded.get("task_latent"))
+
+
+class StageTaskLatent(PrototypeTaskLatent):
+    """Writes the point of the stage at hand: the oracle that knows the task index.
+
+    Reads ``stage (*B,)``, the number of stages that are done.
+
+    Args:
+        task_latents: a point for each stage, ``(stages, m)``; the last one serves beyond the end.
+
+    Example:
+        >>> transform = StageTaskLatent(torch.tensor([[0.0], [1.0]]))
+        >>> transform(TensorDict({"stage": torch.tensor([0, 1, 2])}, [3])).get("task_latent")
+        tensor([[0.],
+                [1.],
+                [1.]])
+    """
+
+    task_latents: Tensor
+
+    def __init__(self, task_latents: Tensor) -> None:
+        super().__init__(task_latents[0])
+        self.register_buffer("task_latents", task_latents.detach().clone())
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the points into a batch of any shape."""
+        stage = tensordict.get("stage").clamp(max=len(self.task_latents) - 1)
+        return tensordict.set("task_latent", self.task_latents[stage])
+
+
+ALIGNMENTS = ("time", "state", "progress")
+"""How a demonstration's embeddings follow an episode; see :class:`DemonstrationTaskLatent`."""
 
 
 class DemonstrationTaskLatent(PrototypeTaskLatent):
     """Writes the embeddings of one demonstration.
 
+    Where the demonstration has ``stage (T,)``, a composition's number of finished tasks, the
+    episode's own ``stage (*B,)`` is read, and each stage is driven by the demonstration's
+    transitions of that stage (those of its last one if it has none).
+
     Args:
         demonstration: the demonstration's transitions, batch size ``(T,)``, with the keys of
             :data:`TRANSITION_KEYS`.
         encoder: :func:`make_task_encoder`'s module, trained.
-        alignment: ``"time"``: at step t the embedding of the demonstration's transition t, and its
-            last one beyond the end; ``"state"``: that of the transition whose observation is
-            nearest.
+        alignment: ``"time"``: as many transitions into the stage as the episode is steps into it,
+            and the stage's last one beyond its end; ``"state"``: the transition whose observation
+            is nearest; ``"progress"``: the transition whose embedding is nearest to that of the
+            episode's last one, of those that follow the one before within ``window``. Time passes
+            alike for a slowed arm; progress waits for it.
+        window: transitions that progress may advance at a step.
 
     Raises:
-        BMRLError: for another alignment.
+        BMRLError: for another alignment, an empty demonstration or a window below one.
     """
 
     def __init__(
-        self, demonstration: TensorDictBase, encoder: TensorDictModule, *, alignment: str = "time"
+        self,
+        demonstration: TensorDictBase,
+        encoder: TensorDictModule,
+        *,
+        alignment: str = "time",
+        window: int = 5,
     ) -> None:
-        if alignment not in ("time", "state"):
-            raise BMRLError(f"unknown alignment {alignment!r}; valid: time, state")
+        if alignment not in ALIGNMENTS:
+            raise UnknownNameError("alignment", alignment, ALIGNMENTS)
+        if not len(demonstration):
+            raise BMRLError("a demonstration of 0 transitions; valid: at least one")
+        if window < 1:
+            raise BMRLError(f"window is {window}; valid: at least 1")
         with torch.no_grad():
             latents = encoder(demonstration.select(*TRANSITION_KEYS)).get("task_latent")
         super().__init__(latents[0])
         self.alignment = alignment
+        self.window = window
+        self.encoder = encoder
         self.register_buffer("latents", latents)
         self.register_buffer("observations", demonstration.get("observation").clone())
-        self._time = torch.zeros((), dtype=torch.int64)
+        stages = demonstration.get("stage", None)
+        if stages is None:
+            stages = torch.zeros(len(latents), dtype=torch.int64)
+        # First and last transition of each stage; of one that is missing, the last of all.
+        number = torch.arange(int(stages.max()) + 2)
+        self.register_buffer("first", torch.searchsorted(stages.contiguous(), number))
+        self.staged = "stage" in demonstration.keys()  # noqa: SIM118 (a TensorDict)
+        self._stage = self._position = torch.zeros((), dtype=torch.int64)
 
-    def _aligned(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self.alignment == "time":
-            latent = self.latents[self._time.clamp(max=len(self.latents) - 1)]
-        else:
-            distance = torch.cdist(
-                tensordict.get("observation").reshape(-1, self.observations.shape[-1]),
-                self.observations,
-            )
-            latent = self.latents[distance.argmin(-1)]
-            latent = latent.reshape(*tensordict.batch_size, latent.shape[-1])
-        return tensordict.set("task_latent", latent)
+    def _candidates(self) -> tuple[Tensor, Tensor]:
+        """First and last transition that may drive each episode now."""
+        low = self.first[self._stage.clamp(max=len(self.first) - 2)]
+        return low, self.first[self._stage.clamp(max=len(self.first) - 2) + 1] - 1
+
+    def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.set("task_latent", self.latents[self._position])
+
+    def _nearest(self, distance: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        """Index of the smallest ``distance (*B, T)`` between ``low`` and ``high (*B,)``."""
+        number = torch.arange(len(self.latents), device=distance.device)
+        outside = (number < low.unsqueeze(-1)) | (number > high.unsqueeze(-1))
+        return distance.masked_fill(outside, torch.inf).argmin(-1)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        start = torch.zeros(
-            tensordict_reset.batch_size, dtype=torch.int64, device=self.latents.device
-        )
+        shape, device = tensordict_reset.batch_size, self.latents.device
+        start = torch.zeros(shape, dtype=torch.int64, device=device)
         reset = None if tensordict is None else tensordict.get("_reset", None)
         # Of several environments some may restart while others go on.
-        self._time = (
-            start if reset is None else torch.where(reset.reshape(start.shape), start, self._time)
-        )
-        return self._aligned(tensordict_reset)
+        anew = torch.ones_like(start, dtype=torch.bool) if reset is None else reset.reshape(shape)
+        stage = tensordict_reset.get("stage") if self.staged else start
+        self._stage = torch.where(anew, stage, self._stage)
+        low, high = self._candidates()
+        if self.alignment == "state":
+            low = self._nearest(self._state_distance(tensordict_reset), low, high)
+        self._position = torch.where(anew, low, self._position)
+        return self._write(tensordict_reset)
 
+    def _state_distance(self, tensordict: TensorDictBase) -> Tensor:
+        observation = tensordict.get("observation").unsqueeze(-2)
+        return (observation - self.observations).norm(dim=-1)
+
+    @torch.no_grad()
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self._time = self._time + 1
-        return self._aligned(next_tensordict)
+        stage = next_tensordict.get("stage") if self.staged else self._stage
+        moved = stage != self._stage
+        self._stage = stage
+        low, high = self._candidates()
+        if self.alignment == "time":
+            position = torch.minimum(self._position + 1, high)
+        elif self.alignment == "state":
+            position = self._nearest(self._state_distance(next_tensordict), low, high)
+        else:
+            last = self.encoder(last_transition(tensordict, next_tensordict)).get("task_latent")
+            distance = (last.unsqueeze(-2) - self.latents).norm(dim=-1)
+            ahead = torch.minimum(self._position + self.window, high)
+            position = self._nearest(distance, torch.minimum(self._position, high), ahead)
+        if self.alignment != "state":
+            position = torch.where(moved, low, position)
+        self._position = position
+        return self._write(next_tensordict)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Not defined outside an environment: the alignment needs an episode."""
