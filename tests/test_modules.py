@@ -38,6 +38,7 @@ from torchrl_bmrl.modules import (
     OnlineTaskLatent,
     PLASPolicy,
     PrototypeTaskLatent,
+    StageTaskLatent,
     make_decoder,
     make_latent_actor,
     make_perturbation_network,
@@ -499,6 +500,100 @@ def test_demonstration_by_state_takes_the_nearest_observation(
         data["action"] = torch.zeros(*batch_size, ACTION_DIM)
         latent = env.step(data)["next", "task_latent"]
         assert torch.equal(latent, latents[nearest].expand(*batch_size, TASK_LATENT_DIM))
+
+
+def staged() -> TensorDict:
+    """Seven transitions of a demonstration: three of stage 0, two of stage 1, two after the end."""
+    data = transitions(7, dtype=torch.float32)
+    return data.set("stage", torch.tensor([0, 0, 0, 1, 1, 2, 2]))
+
+
+def driven(transform: Transform, stages: list[int], batch_size: tuple[int, ...] = ()) -> Tensor:
+    """``task_latent`` before each step of an episode that is at ``stages``."""
+
+    def at(stage: int) -> TensorDict:
+        data = transitions(1, dtype=torch.float32)[0].exclude("next").expand(*batch_size)
+        return data.clone().set("stage", torch.full(batch_size, stage))
+
+    latents = [transform._reset(None, at(stages[0]))["task_latent"]]
+    for stage in stages[1:]:
+        following = at(stage).set("reward", torch.zeros(*batch_size, 1))
+        latents.append(transform._step(at(stage), following)["task_latent"])
+    return torch.stack(latents, -2)
+
+
+@pytest.mark.parametrize("batch_size", [(), (2,)])
+def test_a_staged_demonstration_by_time_waits_for_the_stage_and_starts_anew_with_it(
+    batch_size: tuple[int, ...], encoder: TensorDictModule
+) -> None:
+    transform = DemonstrationTaskLatent(staged(), encoder)
+    expected = embedded(encoder, staged())[[0, 1, 2, 2, 2, 3, 5, 6, 6]]
+    latents = driven(transform, [0, 0, 0, 0, 0, 1, 2, 2, 2], batch_size)
+    assert torch.equal(latents, expected.expand_as(latents))
+
+
+@pytest.mark.parametrize("alignment", ["state", "progress"])
+def test_a_staged_demonstration_drives_a_stage_with_its_own_transitions_alone(
+    alignment: str, encoder: TensorDictModule
+) -> None:
+    transform = DemonstrationTaskLatent(staged(), encoder, alignment=alignment)
+    latents = embedded(encoder, staged())
+    stages = [0, 0, 0, 1, 1, 1, 2, 2]
+    for latent, stage in zip(driven(transform, stages), stages, strict=True):
+        mine = latents[staged()["stage"] == stage]
+        assert (latent == mine).all(-1).any()
+
+
+def test_a_stage_that_the_demonstration_lacks_is_driven_by_its_last(
+    encoder: TensorDictModule,
+) -> None:
+    transform = DemonstrationTaskLatent(staged()[:5], encoder)
+    latents = driven(transform, [1, 1, 2, 2])
+    assert torch.equal(latents[1:], embedded(encoder, staged())[[4, 4, 4]][: len(latents) - 1])
+
+
+def test_progress_never_goes_back_nor_further_than_its_window(encoder: TensorDictModule) -> None:
+    data = transitions(40, dtype=torch.float32)
+    latents = embedded(encoder, data)
+    for window in (1, 4):
+        transform = DemonstrationTaskLatent(data, encoder, alignment="progress", window=window)
+        rollout = TransformedEnv(Walk(), transform).rollout(6)
+        taken = rollout["next", "task_latent"]
+        position = [int((latents == latent).all(-1).nonzero()[0]) for latent in taken]
+        steps = torch.tensor([0, *position]).diff()
+        assert (steps >= 0).all()
+        assert (steps <= window).all()
+
+
+def test_progress_follows_an_episode_that_repeats_the_demonstration(
+    encoder: TensorDictModule,
+) -> None:
+    data = transitions(8, dtype=torch.float32)
+    transform = DemonstrationTaskLatent(data, encoder, alignment="progress")
+    latents = embedded(encoder, data)
+    transform._reset(None, data[0].exclude("next"))
+    for t in range(8):
+        for _ in range(2):  # at half the speed
+            following = data[t]["next"].clone()
+            latent = transform._step(data[t], following)["task_latent"]
+            assert torch.equal(latent, latents[t])
+
+
+@pytest.mark.parametrize(
+    ("rows", "options", "says"),
+    [(0, {}, "0 transitions; valid: at least one"), (4, {"window": 0}, "window is 0; valid")],
+)
+def test_a_demonstration_that_cannot_drive_is_refused(
+    rows: int, options: dict[str, Any], says: str, encoder: TensorDictModule
+) -> None:
+    with pytest.raises(BMRLError, match=says):
+        DemonstrationTaskLatent(demonstration()[:rows], encoder, **options)
+
+
+def test_the_stage_chooses_among_points() -> None:
+    points = torch.tensor([[0.0, 1.0], [2.0, 3.0]])
+    latents = driven(StageTaskLatent(points), [0, 0, 1, 2], (3,))
+    assert torch.equal(latents, points[[0, 0, 1, 1]].expand(3, 4, 2))
 
 
 def test_sources_hold_copies_without_gradients(encoder: TensorDictModule) -> None:

@@ -205,8 +205,8 @@ def show_results(folder: Path) -> dict[str, bytes]:
 def run(recipes: Any) -> Iterator[Run]:
     """Runs a recipe's function in this process, with episodes of ten steps."""
     pytest.importorskip("robosuite", exc_type=ImportError)
+    from torchrl_bmrl import names
     from torchrl_bmrl.evaluation import rollout
-    from torchrl_bmrl.experts import collect
 
     def run(folder: Path, function: Any, *overrides: str) -> Path:
         settings = configured(*SMALL, f"run_dir={folder}", "workers=1", *overrides)
@@ -214,7 +214,7 @@ def run(recipes: Any) -> Iterator[Run]:
         return folder
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(collect, "HORIZON", HORIZON)
+        patch.setattr(names, "HORIZON", HORIZON)
         patch.setitem(rollout.evaluate_policy.__kwdefaults__, "max_steps", HORIZON)
         yield run
 

@@ -16,10 +16,13 @@ from torchrl_bmrl.data.episodes import Episode, stack_episodes
 from torchrl_bmrl.envs.transforms import (
     OBSERVATION_PARTS,
     ObservationStatistics,
+    PerturbAction,
     SinCosTransform,
     make_observation_transform,
+    tilt,
     transform_data,
 )
+from torchrl_bmrl.errors import BMRLError
 
 SIZES = {
     "robot0_joint_pos": 7,
@@ -193,3 +196,107 @@ def test_data_and_environment_give_the_same_observation_for_the_same_episode() -
     for key in ("observation", ("next", "observation"), ("next", "reward"), "action"):
         assert lived[key].shape == stored[key].shape
         assert lived[key].equal(stored[key]), key
+
+
+# -- perturbed actions -----------------------------------------------------------------------------
+
+
+def executed(transform: PerturbAction, action: torch.Tensor) -> torch.Tensor:
+    return transform.inv(TensorDict({"action": action}, action.shape[:-1]))["action"]
+
+
+def angle(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    return torch.rad2deg(torch.cosine_similarity(a, b, -1).clamp(-1, 1).acos())
+
+
+def test_the_motion_is_scaled_within_the_range_and_the_gripper_left_alone() -> None:
+    torch.manual_seed(0)
+    action = 0.4 * torch.randn(1000, 7).clamp(-1, 1)
+    after = executed(PerturbAction(magnitude=(0.5, 1.5)), action)
+    factor = after[:, :6] / action[:, :6]
+    torch.testing.assert_close(factor, factor[:, :1].expand(-1, 6))
+    assert 0.5 <= factor.min() < 0.51
+    assert 1.49 < factor.max() <= 1.5
+    assert torch.equal(after[:, 6], action[:, 6])
+
+
+def test_the_position_is_tilted_by_up_to_the_angle_and_keeps_its_length() -> None:
+    torch.manual_seed(0)
+    action = 0.5 * torch.nn.functional.normalize(torch.randn(2000, 7), dim=-1)
+    after = executed(PerturbAction(max_angle=45.0), action)
+    turned = angle(after[:, :3], action[:, :3])
+    assert turned.max() <= 45.01
+    assert abs(turned.mean() - 22.5) < 1.0  # uniform
+    torch.testing.assert_close(after[:, :3].norm(dim=-1), action[:, :3].norm(dim=-1))
+    torch.testing.assert_close(after[:, 3:], action[:, 3:])
+
+
+def test_what_is_executed_stays_within_the_bounds() -> None:
+    after = executed(PerturbAction(magnitude=(3.0, 3.0), max_angle=45.0), torch.ones(50, 7))
+    assert after.abs().max() == 1.0
+
+
+def test_no_motion_stays_no_motion() -> None:
+    after = executed(PerturbAction(magnitude=(0.5, 1.5), max_angle=45.0), torch.zeros(5, 7))
+    assert torch.equal(after, torch.zeros(5, 7))
+
+
+@pytest.mark.parametrize("per", ["step", "episode"])
+def test_the_draw_lasts_a_step_or_an_episode(per: str) -> None:
+    torch.manual_seed(0)
+    transform = PerturbAction(magnitude=(0.5, 1.5), max_angle=45.0, per=per)
+    action = torch.full((4, 7), 0.3)
+
+    def start(mask: torch.Tensor | None) -> list[torch.Tensor]:
+        reset = None if mask is None else TensorDict({"_reset": mask}, [4])
+        transform._reset(reset, TensorDict({}, [4]))
+        return [executed(transform, action) for _ in range(2)]
+
+    first, second = start(None)
+    assert torch.equal(first, second) == (per == "episode")
+    assert len(first.unique(dim=0)) == 4  # each episode has its own
+    again = start(torch.tensor([[True], [False], [False], [False]]))[0]
+    assert not torch.equal(again[0], first[0])
+    assert torch.equal(again[1:], first[1:]) == (per == "episode")
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"magnitude": (1.5, 0.5)}, "magnitude is"),
+        ({"magnitude": (-1.0, 0.5)}, "magnitude is"),
+        ({"max_angle": 200.0}, "max_angle is 200.0; valid: between 0 and 180"),
+        ({"per": "task"}, "'task'; valid pers: step, episode"),
+    ],
+)
+def test_an_invalid_perturbation_is_named(options: dict, says: str) -> None:
+    with pytest.raises(BMRLError, match=says):
+        PerturbAction(**options)
+
+
+def test_a_right_angle_is_a_cross_product_away() -> None:
+    torch.manual_seed(0)
+    vector, towards = torch.randn(2, 20, 3)
+    turned = tilt(vector, towards, torch.full((20, 1), torch.pi / 2))
+    normal = torch.linalg.cross(vector, towards)
+    torch.testing.assert_close((turned * vector).sum(-1), torch.zeros(20), atol=1e-5, rtol=0)
+    torch.testing.assert_close((turned * normal).sum(-1), torch.zeros(20), atol=1e-5, rtol=0)
+    assert ((turned * towards).sum(-1) > 0).all()
+
+
+def test_the_data_keep_the_policys_action_and_the_simulator_gets_the_perturbed_one() -> None:
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    from torchrl_bmrl.envs.transforms import make_env
+
+    action = torch.tensor([0.0, 0.0, 0.4, 0.0, 0.0, 0.0, 0.0])
+    up = TensorDictModule(lambda _: action, ["observation"], ["action"])
+
+    heights = []
+    for factor in (1.0, 0.5):
+        env = make_env("reach", None, PerturbAction(magnitude=(factor, factor)))
+        env.set_seed(0)
+        data = env.rollout(20, up)
+        assert (data["action"][:, 2] == torch.tensor(0.4)).all()
+        heights.append(float(data["next", "observation"][-1, 25] - data["observation"][0, 25]))
+        env.close()
+    assert 0 < heights[1] < 0.7 * heights[0]

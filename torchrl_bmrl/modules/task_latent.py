@@ -191,7 +191,7 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
 
     Where the demonstration has ``stage (T,)``, a composition's number of finished tasks, the
     episode's own ``stage (*B,)`` is read, and each stage is driven by the demonstration's
-    transitions of that stage (those of its last one if it has none).
+    transitions of that stage (stages that it lacks, by those of its last one).
 
     Args:
         demonstration: the demonstration's transitions, batch size ``(T,)``, with the keys of
@@ -233,7 +233,7 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
         stages = demonstration.get("stage", None)
         if stages is None:
             stages = torch.zeros(len(latents), dtype=torch.int64)
-        # First and last transition of each stage; of one that is missing, the last of all.
+        # Where each stage begins, and the end.
         number = torch.arange(int(stages.max()) + 2)
         self.register_buffer("first", torch.searchsorted(stages.contiguous(), number))
         self.staged = "stage" in demonstration.keys()  # noqa: SIM118 (a TensorDict)
@@ -241,8 +241,13 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
 
     def _candidates(self) -> tuple[Tensor, Tensor]:
         """First and last transition that may drive each episode now."""
-        low = self.first[self._stage.clamp(max=len(self.first) - 2)]
-        return low, self.first[self._stage.clamp(max=len(self.first) - 2) + 1] - 1
+        return self.first[self._stage], self.first[self._stage + 1] - 1
+
+    def _stage_of(self, tensordict: TensorDictBase, otherwise: Tensor) -> Tensor:
+        """The episodes' stages, of those that the demonstration has."""
+        if not self.staged:
+            return otherwise
+        return tensordict.get("stage").clamp(max=len(self.first) - 2)
 
     def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.set("task_latent", self.latents[self._position])
@@ -261,8 +266,7 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
         reset = None if tensordict is None else tensordict.get("_reset", None)
         # Of several environments some may restart while others go on.
         anew = torch.ones_like(start, dtype=torch.bool) if reset is None else reset.reshape(shape)
-        stage = tensordict_reset.get("stage") if self.staged else start
-        self._stage = torch.where(anew, stage, self._stage)
+        self._stage = torch.where(anew, self._stage_of(tensordict_reset, start), self._stage)
         low, high = self._candidates()
         if self.alignment == "state":
             low = self._nearest(self._state_distance(tensordict_reset), low, high)
@@ -275,7 +279,7 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        stage = next_tensordict.get("stage") if self.staged else self._stage
+        stage = self._stage_of(next_tensordict, self._stage)
         moved = stage != self._stage
         self._stage = stage
         low, high = self._candidates()
