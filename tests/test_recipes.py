@@ -87,7 +87,7 @@ def configured(*overrides: str) -> DictConfig:
         (["preset=smoke", "bcq.lrr=1"], ["bcq.lrr", "BCQSettings"]),
         (["preset=smoke", "bcq.lr=abc"], ["bcq.lr", "'abc'", "Float"]),
         (["preset=smoke", "tasks=[lfit]"], ["error: unknown task 'lfit'", "reach, lift, push_r"]),
-        (["preset=fast"], ["preset/fast", "literal", "paper", "quick", "smoke"]),
+        (["preset=fast"], ["preset/fast", "compose", "literal", "paper", "quick", "smoke"]),
         (["preset=smoke", "logger=log"], ["unknown logger 'log'", "csv, wandb, tensorboard, none"]),
         (["preset=smoke", "distill.updates=-5"], ["error: distill.updates is -5", "above 0"]),
     ],
@@ -154,7 +154,7 @@ def test_every_stage_is_checked_before_the_first_one_starts(
         recipes.check_settings(config)
 
 
-@pytest.mark.parametrize("preset", ["smoke", "quick", "paper", "literal"])
+@pytest.mark.parametrize("preset", ["smoke", "quick", "paper", "literal", "compose"])
 def test_every_preset_is_complete_and_valid(recipes: Any, tmp_path: Path, preset: str) -> None:
     config = OmegaConf.to_object(configured(f"preset={preset}", f"run_dir={tmp_path}"))
     recipes.check_settings(config)
@@ -767,3 +767,90 @@ def test_learning_from_people_compares_every_share_and_goes_on(
         learn_from_people.train_job((config, share, 0), lambda _: None)
     scripted, human = (buffer.sample()["index"] for buffer in buffers)
     assert scripted.max() < HORIZON <= human.min()
+
+
+# -- one-shot imitation ----------------------------------------------------------------------------
+
+IMITATE = ["imitate.composition=reach-lift", "imitate.demonstrations=2", "imitate.episodes=4"]
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_imitation_compares_every_method_and_perturbation_and_goes_on(
+    run: Run, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import imitate
+
+    monkeypatch.setattr(imitate, "PERTURBATIONS", ("none", "both, constant"))
+    folder = Path(shutil.copytree(finished, tmp_path / "run"))
+    run(folder, imitate.imitate, *IMITATE)
+    with (folder / "imitation" / "results.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    cells = {(row["method"], row["perturbation"], row["demonstration"]) for row in rows}
+    assert len(cells) == len(imitate.METHODS) * 2 * 2
+    assert len(rows) == 2 * len(cells)
+    assert {row["stages"] for row in rows} <= {"0", "1", "2"}
+    assert all((row["stages"] == "2") == (row["success"] == "1") for row in rows)
+    table = (folder / "tables" / "imitation.csv").read_text().splitlines()
+    assert table[0] == "Method,Perturbation,1. Reach,2. Lift,Whole,95% interval,Episodes"
+    assert len(table) == 1 + len(imitate.METHODS) * 2
+
+    written = contents(folder, "imitation/*", "tables/imitation.*")
+    (folder / "imitation" / "replay-none-1.csv").unlink()  # as a kill would leave it
+    run(folder, imitate.imitate, *IMITATE)
+    assert contents(folder, "imitation/*", "tables/imitation.*") == written
+
+    # A study is held to its own settings; the run's others stay free.
+    with pytest.raises(SystemExit):
+        run(folder, imitate.imitate, *IMITATE, "imitate.max_angle=10")
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_what_drives_imitation_is_one_demonstration_from_another_start(
+    run: Run, finished: Path, tmp_path: Path
+) -> None:
+    import imitate
+
+    from torchrl_bmrl.data.demonstrations import read_statistics
+
+    settings = configured(*SMALL, *IMITATE, f"run_dir={tmp_path}", "workers=1")
+    config = OmegaConf.to_object(settings)
+    paths = [imitate.demonstrate(config, number) for number in (0, 1)]
+    statistics = read_statistics(finished / "data")
+    first, second = (imitate.read_demonstration(path, statistics) for path in paths)
+    assert first["stage"].unique().tolist() == second["stage"].unique().tolist() == [0, 1, 2]
+    assert not torch.equal(first["observation"][0], second["observation"][0])
+    # Open loop: the actions of the demonstration, whatever happens.
+    policy, (counter,) = imitate.make_method(config, "replay", paths[0], statistics)
+    from torchrl_bmrl.envs.transforms import make_env
+
+    played = make_env("reach-lift", statistics, counter).rollout(20, policy)
+    assert torch.equal(played["action"], first["action"][:20])
+    # Cloning fits that demonstration.
+    clone, _ = imitate.make_method(config, "cloning", paths[0], statistics)
+    error = (clone(first.select("observation"))["action"] - first["action"]).square().mean()
+    assert error < 0.5 * first["action"].var(0).mean()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (["imitate.composition=reach-push_up"], "imitate.composition is reach-push_up, but the"),
+        (["imitate.composition=reach-lfit"], "unknown task 'lfit'"),
+        (["imitate.episodes=7", "imitate.demonstrations=2"], "a multiple of"),
+        ([], "checkpoint.safetensors"),
+    ],
+    ids=["task the policy lacks", "no task", "uneven episodes", "no student"],
+)
+def test_imitation_names_what_is_wrong_and_writes_no_study(
+    recipes: Any, tmp_path: Path, overrides: list[str], says: str, capsys: Any
+) -> None:
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    import imitate
+
+    settings = configured(*SMALL, *overrides, f"run_dir={tmp_path}", "workers=1")
+    with pytest.raises(SystemExit):
+        recipes.run_recipe(settings, imitate.imitate)
+    assert says in capsys.readouterr().err
+    assert not (tmp_path / "imitation").exists()
