@@ -121,7 +121,7 @@ def test_embeddings_of_other_sizes_are_shown_in_a_plane_and_the_page_says_so(dim
     assert all(len(e["x"]) == len(e["y"]) == STEPS for e in content["episodes"])
     axis = "principal component 1 (no unit)" if dim == 3 else "m 1 (no unit)"
     assert content["axes"][0] == axis
-    assert ("3-D, its first two principal components" in text) == (dim == 3)
+    assert ("is 3-D; drawn are its first two principal components" in text) == (dim == 3)
     assert ("1-D, drawn on a line" in text) == (dim == 1)
 
 

@@ -155,7 +155,7 @@ class Explorer:
             "it, or move the slider, to follow it through the embedding beside its film."
         ]
         if note:
-            text.append(f"The embedding is {note.strip()}.")
+            text.append(f"The embedding is {note.strip().replace(', its', '; drawn are its')}.")
         if self.frames:
             filmed = len({key[:2] for key in self.frames})
             text.append(f"{filmed} episodes have a film, rendered from their simulator states.")
