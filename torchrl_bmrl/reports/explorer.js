@@ -150,6 +150,16 @@
     pen.stroke();
   }
 
+  function line(episode, first, last, stroke, width) {
+    context.beginPath();
+    for (let row = first; row <= last; row += 1) {
+      context.lineTo(view.x(episode.x[row]), view.y(episode.y[row]));
+    }
+    context.strokeStyle = stroke;
+    context.lineWidth = width;
+    context.stroke();
+  }
+
   function draw() {
     context.setTransform(1, 0, 0, 1, 0, 0);
     context.clearRect(0, 0, canvas.width, canvas.height);
@@ -162,11 +172,9 @@
     context.setTransform(view.ratio, 0, 0, view.ratio, 0, 0);
     const chosen = data.episodes[state.episode];
     chosen.x.forEach((_, row) => dot(context, chosen, row, 3, color(chosen, row)));
-    context.beginPath();
-    chosen.x.forEach((x, row) => context.lineTo(view.x(x), view.y(chosen.y[row])));
-    context.strokeStyle = "#1d2129";
-    context.lineWidth = 1;
-    context.stroke();
+    // The whole way faintly, for it may be a tangle; its last half second clearly.
+    line(chosen, 0, chosen.x.length - 1, "rgba(29, 33, 41, 0.3)", 0.8);
+    line(chosen, Math.max(0, state.row - 10), state.row, "#1d2129", 2);
     dot(context, chosen, state.row, 7, color(chosen, state.row), "#000");
     if (!state.hovered) return;
     const [episode, row] = state.hovered;

@@ -151,8 +151,8 @@ class Explorer:
         _, note = _plane(self.task_latent)
         text = [
             "Each point is the embedding m of one transition of a held-out demonstration. Point at "
-            "one to see its moment, click to choose it. The black line is the chosen episode; play "
-            "it, or move the slider, to follow it through the embedding beside its film."
+            "one to see its moment, click to choose it. The line is the chosen episode, its last "
+            "half second in black; play it, or move the slider, to follow it beside its film."
         ]
         if note:
             text.append(f"The embedding is {note.strip().replace(', its', '; drawn are its')}.")
