@@ -34,6 +34,7 @@ from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.names import HORIZON, TASKS
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
 from torchrl_bmrl.reports import Embeddings, write_report
+from torchrl_bmrl.reports.films import explore_demonstrations
 from torchrl_bmrl.runs import read_versions
 
 
@@ -156,6 +157,7 @@ def evaluate(config: Config) -> None:
         facts=run_facts(config),
         embeddings=embeddings,
         accuracy=accuracy,
+        explorer=explore_demonstrations(run_dir / "data", embeddings),
         seed=config.seed,
     )
     print((run_dir / "tables" / "results.md").read_text())

@@ -260,6 +260,7 @@ def test_two_stages_from_an_empty_folder_to_the_report_and_again(tmp_path: Path)
     page = (folder / "report.html").read_text()
     assert page.rstrip().endswith("</html>")
     assert page.count("data:image/png;base64") >= 2
+    assert "Explore the embedding" in page
     assert yaml.safe_load((folder / "config.yaml").read_text())["bcq"]["num_cells"] == [16, 16]
     versions = json.loads((folder / "versions.json").read_text())
     assert {"torch", "torchrl", "robosuite", "mujoco", "python", "torchrl_bmrl"} <= set(versions)

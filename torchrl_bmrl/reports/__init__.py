@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torchrl_bmrl.reports.explorer import Explorer
 from torchrl_bmrl.reports.figures import (
     TASK_COLORS,
     embedding_scatter,
@@ -16,6 +17,7 @@ from torchrl_bmrl.reports.tables import Table, results_table, table_1, table_2, 
 __all__ = [
     "TASK_COLORS",
     "Embeddings",
+    "Explorer",
     "Picture",
     "Section",
     "Table",

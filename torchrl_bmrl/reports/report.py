@@ -17,6 +17,7 @@ from torchrl_bmrl.evaluation.results import Summary, read_results, summarise
 from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports import paper
+from torchrl_bmrl.reports.explorer import Explorer
 from torchrl_bmrl.reports.figures import (
     Curve,
     embedding_scatter,
@@ -98,6 +99,7 @@ def write_report(
     facts: Mapping[str, str],
     embeddings: Embeddings | None = None,
     accuracy: float | None = None,
+    explorer: Explorer | None = None,
     seed: int = 0,
 ) -> Path:
     """Writes tables, figures and ``report.html`` of a run folder from its ``results.csv``.
@@ -113,6 +115,7 @@ def write_report(
         facts: Names and values for the box at the top of the page.
         embeddings: Transitions to draw, from held-out data.
         accuracy: Held-out classification accuracy of the embedding, in [0, 1].
+        explorer: Transitions to explore, from held-out data.
         seed: Seed of t-SNE.
 
     Returns:
@@ -159,10 +162,18 @@ def write_report(
                 heading="Stage 2: one distilled policy for all tasks", tables=[tables["table2"]]
             ),
             Section(heading="The task embedding", paragraphs=note2, pictures=list(stage2.values())),
+            *_explore(explorer),
             Section(heading="Everything measured", tables=[tables["results"]]),
         ],
     )
     return page
+
+
+def _explore(explorer: Explorer | None) -> list[Section]:
+    if explorer is None:
+        return []
+    heading = "Explore the embedding"
+    return [Section(heading=heading, paragraphs=explorer.paragraphs(), explorer=explorer)]
 
 
 def _headline(
