@@ -54,6 +54,8 @@ def test_what_follows_the_first_success_is_left_out_in_any_order() -> None:
     step = np.tile(np.arange(5), 3)
     success = np.array([0, 0, 1, 0, 1] + [0] * 5 + [1, 0, 0, 0, 0], dtype=bool)
     expected = np.array([1, 1, 1, 0, 0] + [1] * 5 + [1, 0, 0, 0, 0], dtype=bool)
+    longer = np.array([1, 1, 1, 1, 0] + [1] * 5 + [1, 1, 0, 0, 0], dtype=bool)
+    assert (until_success(success, episode, step, tail=1) == longer).all()
     order = np.random.default_rng(0).permutation(15)
     assert (until_success(success, episode, step) == expected).all()
     assert (until_success(success[order], episode[order], step[order]) == expected[order]).all()

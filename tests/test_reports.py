@@ -19,6 +19,7 @@ for extra in ("scipy", "matplotlib", "jinja2", "sklearn"):
 
 from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.evaluation import ResultRow, summarise, write_results
+from torchrl_bmrl.evaluation.embedding import STAGE_TAIL
 from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports import (
     TASK_COLORS,
@@ -325,8 +326,8 @@ def test_stages_and_distances_that_are_there_are_found(dim: int) -> None:
     stages = measure_stages(training, held_out)
     assert [r.task for r in stages] == [t for t in TASKS if t != "reach"]
     for result in stages:
-        # Three episodes until their first success, which is step 6.
-        assert (result.episodes, result.transitions) == (3, 21)
+        # Three episodes of eight steps, all within the tail after success at step 6.
+        assert (result.episodes, result.transitions) == (3, 24)
         assert result.agreement["embedding"].value > result.agreement["raw transition"].value
     distances = measure_goal_distance(training, held_out)
     assert [r.task for r in distances] == list(TASKS)
@@ -348,9 +349,13 @@ def test_what_happens_after_success_changes_no_number() -> None:
         phase=np.where(after, 0, data.phase),
         distance=np.where(after, 9.0, data.distance),
     )
-    for measure in (measure_stages, measure_goal_distance):
-        assert measure(moved, moved) == measure(data, data)
-        assert measure(data, replace(data, success=data.step >= 3)) != measure(data, data)
+    assert measure_goal_distance(moved, moved) == measure_goal_distance(data, data)
+    sooner = replace(data, success=data.step >= 3)
+    assert measure_goal_distance(data, sooner) != measure_goal_distance(data, data)
+    # Stages look further, by STAGE_TAIL steps.
+    late = [replace(x, step=np.where(after, x.step + STAGE_TAIL, x.step)) for x in (data, moved)]
+    assert measure_stages(late[0], late[0]) == measure_stages(late[1], late[1])
+    assert measure_stages(data, data) != measure_stages(moved, moved)
 
 
 def test_groups_are_found_in_training_data_alone() -> None:
@@ -369,7 +374,7 @@ def test_the_tables_hold_what_was_measured() -> None:
         assert line["Phases"] == "descend, grasp, lift"
         assert line["Embedding"] == str(result.agreement["embedding"])
         assert line["Raw transition"] == str(result.agreement["raw transition"])
-        assert (line["Episodes"], line["Transitions"]) == ("3", "21")
+        assert (line["Episodes"], line["Transitions"]) == ("3", "24")
     for result, line in zip(distances, cells(goal_distance_table(distances)), strict=True):
         assert line["Embedding"] == str(result.correlation["embedding"])
         assert line["Lowest episode"] == f"{result.lowest:.2f}"

@@ -1,8 +1,8 @@
 """What the embedding m knows of a task: its stages, and the distance to its goal.
 
-Everything here looks at transitions up to the first that succeeds (:func:`until_success`): after it
-an expert holds still, for most of an episode, and what an action's noise does there is neither a
-stage nor a way.
+Distances are measured on transitions up to the first that succeeds (:func:`until_success`), stages
+on :data:`STAGE_TAIL` steps more: after that an expert holds still, for most of an episode, and what
+an action's noise does there is neither a stage nor a way.
 
 Needs scipy and scikit-learn, of the ``[reports]`` extra.
 """
@@ -18,6 +18,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.evaluation.statistics import bootstrap_interval
+
+STAGE_TAIL = 10
+"""Steps after success that count as the last stage, half a second.
+
+A task succeeds as soon as its last stage has got far enough: cut there, a lift's last stage is a
+third as long as the others.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,13 +87,16 @@ class GoalDistanceResult:
     transitions: int
 
 
-def until_success(success: ArrayLike, episode: ArrayLike, step: ArrayLike) -> NDArray[np.bool_]:
+def until_success(
+    success: ArrayLike, episode: ArrayLike, step: ArrayLike, *, tail: int = 0
+) -> NDArray[np.bool_]:
     """Which transitions lie on the way: those up to and with the first that succeeds.
 
     Args:
         success: Whether a transition meets the task's goal, shape ``(N,)``.
         episode: Episode within the task, shape ``(N,)``, in any order.
         step: Step within the episode, shape ``(N,)``.
+        tail: So many steps after the success are on the way, too.
 
     Returns:
         Mask, shape ``(N,)``. An episode without success is on the way to its end.
@@ -104,7 +114,7 @@ def until_success(success: ArrayLike, episode: ArrayLike, step: ArrayLike) -> ND
     for number in np.unique(episode):
         rows = episode == number
         if success[rows].any():
-            on_the_way[rows] = step[rows] <= step[rows & success].min()
+            on_the_way[rows] = step[rows] <= step[rows & success].min() + tail
     return on_the_way
 
 
@@ -157,7 +167,7 @@ def find_stages(
 
 
 def stage_agreement(
-    stage: ArrayLike, phase: ArrayLike, episode: ArrayLike, *, resamples: int = 500, seed: int = 0
+    stage: ArrayLike, phase: ArrayLike, episode: ArrayLike, *, resamples: int = 200, seed: int = 0
 ) -> Estimate:
     """Adjusted mutual information of groups and recorded phases.
 
@@ -234,7 +244,7 @@ def distance_correlations(
 
 
 def spread_ratio(
-    start: ArrayLike, end: ArrayLike, *, resamples: int = 500, seed: int = 0
+    start: ArrayLike, end: ArrayLike, *, resamples: int = 200, seed: int = 0
 ) -> Estimate:
     """How far apart episodes end in the embedding, over how far apart they start.
 

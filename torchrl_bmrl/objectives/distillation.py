@@ -27,6 +27,7 @@ from torchrl_bmrl.objectives.checks import (
     check_number,
     check_same_shape,
     entry,
+    next_key,
     output,
     read,
 )
@@ -90,8 +91,8 @@ class MetaDistillationLoss(KeyedLoss):
         metric_margin: α, in units of m.
         isometry_weight: w_s. Default 0, which leaves the term out.
         encoder_terms: terms whose gradient reaches M, of ``"classification"``, ``"generator"``,
-            ``"direction"``, ``"qvalue"`` and ``"metric"``; by default all. The penalty on m always
-            does. ``("classification",)`` is the paper's reading.
+            ``"direction"``, ``"qvalue"`` and ``"metric"``; by default all. The penalty on m and
+            the isometry term always do. ``("classification",)`` is the paper's reading.
         context: which transition m is computed from: ``"current"`` (the paper's), ``"previous"``
             (the one before it in the episode, under the key ``"previous"``), ``"random"`` (another
             one of the task in the batch) or ``"set"`` (the mean over ``context_size`` such).
@@ -152,6 +153,7 @@ class MetaDistillationLoss(KeyedLoss):
             task_latent: the embedding m.
             task_logits: the classifier's output.
             task: class index y.
+            reward: under ``"next"``; read with ``isometry_weight`` alone.
             state_action_value: the critics' output.
             previous: where the previous transition lies.
             priority: written to the input.
@@ -163,6 +165,7 @@ class MetaDistillationLoss(KeyedLoss):
         task_latent: NestedKey = "task_latent"
         task_logits: NestedKey = "task_logits"
         task: NestedKey = "task"
+        reward: NestedKey = "reward"
         state_action_value: NestedKey = "state_action_value"
         previous: NestedKey = "previous"
         priority: NestedKey = "td_error"
@@ -290,6 +293,8 @@ class MetaDistillationLoss(KeyedLoss):
         """The transition that m is computed from, what the teachers read, and the task."""
         keys = [*self.task_encoder.in_keys, *self._teacher_observation_keys]
         keys.append(self.tensor_keys.task)
+        if self.isometry_weight is not None:
+            keys += [key for key in self._content_keys if key not in keys]
         if self.context == "previous":
             previous = self.tensor_keys.previous
             keys += [unravel_key((previous, key)) for key in self.task_encoder.in_keys]
@@ -308,6 +313,10 @@ class MetaDistillationLoss(KeyedLoss):
             "accuracy",
             "latent_norm",
         ]
+
+    @property
+    def _content_keys(self) -> list[NestedKey]:
+        return [next_key(self.tensor_keys.reward), self.tensor_keys.action]
 
     @property
     def _teacher_observation_keys(self) -> list[NestedKey]:
@@ -423,7 +432,7 @@ class MetaDistillationLoss(KeyedLoss):
     def spread_out(self, tensordict: TensorDictBase) -> Tensor:
         """Error of each row's distances in m to its task's other rows, ``(num_tasks, B)``."""
         # Not embed's: m of a set has no reward and action of its own.
-        _, action, reward, _ = (entry(tensordict, key) for key in self.task_encoder.in_keys)
+        reward, action = (entry(tensordict, key) for key in self._content_keys)
         content = torch.cat([reward / self.reward_scale[:, None, None], action], -1)
         return isometry_error(self._encode(tensordict.select(*self.task_encoder.in_keys)), content)
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.evaluation.embedding import (
+    STAGE_TAIL,
     GoalDistanceResult,
     StageResult,
     distance_correlations,
@@ -102,10 +103,15 @@ class Embeddings:
         """The rows by task, episode and step, whatever order they came in."""
         return self.rows(np.lexsort((self.step, self.episode, self.task)))
 
-    def on_the_way(self, task: str) -> Embeddings:
-        """A task's transitions up to the first of their episode that succeeds, in time."""
+    def on_the_way(self, task: str, *, tail: int = 0) -> Embeddings:
+        """A task's transitions up to the first of their episode that succeeds, in time.
+
+        Args:
+            task: its name.
+            tail: so many steps more.
+        """
         own = self.rows(self.task == TASKS.index(task)).in_time()
-        return own.rows(until_success(own.success, own.episode, own.step))
+        return own.rows(until_success(own.success, own.episode, own.step, tail=tail))
 
     @property
     def representations(self) -> dict[str, NDArray[Any]]:
@@ -119,9 +125,9 @@ def name_stages(
     """Groups of a task's held-out transitions on the way, as many as it has phases.
 
     Returns:
-        By representation, a group for each row of ``held_out.on_the_way(task)``.
+        By representation, a group for each row of ``held_out.on_the_way(task, tail=STAGE_TAIL)``.
     """
-    train, test = training.on_the_way(task), held_out.on_the_way(task)
+    train, test = (x.on_the_way(task, tail=STAGE_TAIL) for x in (training, held_out))
     return {
         name: find_stages(
             train.representations[name], points, len(held_out.phase_names[task]), seed=seed
@@ -148,7 +154,7 @@ def measure_stages(
     """
     results = []
     for task, phases in held_out.phase_names.items():
-        train, test = training.on_the_way(task), held_out.on_the_way(task)
+        train, test = (x.on_the_way(task, tail=STAGE_TAIL) for x in (training, held_out))
         if len(phases) < 2 or len(train.task) < len(phases) or not len(test.task):
             continue
         results.append(
