@@ -86,6 +86,7 @@ class DistillSettings:
     latent_norm_weight: float = 2e-3
     metric_weight: float = 0.0  # of the triplet loss on m
     metric_margin: float = 1.0
+    isometry_weight: float = 0.0  # of distances in m that are those of rewards and actions
     normalise_qvalue: bool = True
     prototype: str = "mean"  # or medoid
 
@@ -214,7 +215,12 @@ def check_settings(config: Config) -> None:
     for key in ("bcq.lmbda", "bcq.gamma", "distill.context_fraction"):
         if not 0 <= (value := OmegaConf.select(settings, key)) <= 1:
             raise ConfigError(f"{key} is {value}; valid: between 0 and 1")
-    for key in ("bcq.generator_warmup", "collect.noise", "distill.metric_weight"):
+    for key in (
+        "bcq.generator_warmup",
+        "collect.noise",
+        "distill.metric_weight",
+        "distill.isometry_weight",
+    ):
         if (value := OmegaConf.select(settings, key)) < 0:
             raise ConfigError(f"{key} is {value}; valid: 0 or above")
     for key in ("bcq.critic_grad_clip", "bcq.latent_clip"):

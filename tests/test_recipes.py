@@ -136,6 +136,7 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
         ("bcq.value_bounds=[1,0]", r"value_bounds are .1.0, 0.0.; valid: .*low < high"),
         ("distill.encoder_terms=[critic]", "unknown encoder term 'critic'; .*qvalue, metric"),
         ("distill.metric_weight=-1", "distill.metric_weight is -1.0; valid: 0 or above"),
+        ("distill.isometry_weight=-1", "distill.isometry_weight is -1.0; valid: 0 or above"),
         ("workers=0", "workers is 0"),
         ("bcq.lr=0", "bcq.lr is 0"),
         ("bcq.seeds=0", "bcq.seeds is 0"),
@@ -254,7 +255,7 @@ def test_two_stages_from_an_empty_folder_to_the_report_and_again(tmp_path: Path)
     assert sum(counts.values()) == len(rows)
     assert all(0 < row.episode_return < 600 for row in rows)
 
-    for name in ("results", "table1", "table2"):
+    for name in ("results", "table1", "table2", "stages", "goal_distance"):
         assert "lift" in (folder / "tables" / f"{name}.csv").read_text().lower()
         assert "\n| Lift |" in (folder / "tables" / f"{name}.md").read_text()
     page = (folder / "report.html").read_text()

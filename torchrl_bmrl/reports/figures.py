@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Circle, Patch
 from numpy.typing import NDArray
 
 from torchrl_bmrl.errors import BMRLError
@@ -125,24 +126,7 @@ def embedding_tsne(
         >>> embedding_tsne(points, np.arange(20) % 6)[1:4]
         b'PNG'
     """
-    from sklearn.manifold import TSNE
-    from threadpoolctl import threadpool_limits
-
-    count = len(task_latent)
-    if count < 4:
-        raise BMRLError(f"t-SNE needs at least 4 embeddings, got {count}")
-    chosen = np.arange(count)
-    if count > 3000:
-        chosen = np.sort(np.random.default_rng(seed).choice(count, 3000, replace=False))
-    tsne = TSNE(
-        n_components=2,
-        perplexity=min(30.0, (len(chosen) - 1) / 3),
-        init="pca" if np.shape(task_latent)[1] >= 2 else "random",  # PCA keeps the overall layout
-        random_state=seed,
-    )
-    # Several threads add up in an order that changes from run to run, and so would the map.
-    with threadpool_limits(limits=1):
-        points = tsne.fit_transform(np.asarray(task_latent, dtype=np.float64)[chosen])
+    chosen, points = _tsne(task_latent, seed)
     figure, axes = _square()
     _scatter_by_task(axes, points, task[chosen])
     axes.set_title(f"t-SNE of the task embedding m ({len(chosen):,} transitions)", fontsize=11)
@@ -151,11 +135,64 @@ def embedding_tsne(
     return _png(figure)
 
 
+def embedding_stages(
+    task_latent: NDArray[Any],
+    phase: NDArray[np.integer[Any]],
+    stage: NDArray[np.integer[Any]],
+    phase_names: Sequence[str],
+    *,
+    seed: int = 0,
+) -> bytes:
+    """A t-SNE map of one task's embeddings: recorded phases beside the groups that were found.
+
+    Args:
+        task_latent: Embeddings m of the task's transitions, shape ``(N, d)``, N of at least 4.
+        phase: The expert's phase, shape ``(N,)``, an index into ``phase_names``.
+        stage: Group of each transition, shape ``(N,)``.
+        phase_names: Names of the phases.
+        seed: Seed of t-SNE.
+
+    Returns:
+        PNG image.
+
+    Example:
+        >>> points = np.random.default_rng(0).normal(size=(20, 2))
+        >>> embedding_stages(points, np.arange(20) % 2, np.arange(20) % 2, ["a", "b"])[1:4]
+        b'PNG'
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    count = len(phase_names)
+    shared = np.array(
+        [[((phase == i) & (stage == j)).sum() for j in range(count)] for i in range(count)]
+    )
+    # Groups have no names: they take the phases' colors so that most points keep theirs.
+    named = np.argsort(linear_sum_assignment(-shared)[1])
+    chosen, points = _tsne(task_latent, seed)
+    figure = Figure(figsize=(9.4, 4.9), layout="constrained")
+    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+    colors = np.array(_OKABE_ITO)
+    for axes, label, title in (
+        (left, phase[chosen], "recorded phase of the expert"),
+        (right, named[stage[chosen]], "group found without labels"),
+    ):
+        _tidy(axes)
+        axes.scatter(*points.T, c=colors[label % len(colors)], s=12, alpha=0.8, linewidths=0)
+        axes.set_title(title, fontsize=11)
+        axes.set_xlabel("t-SNE 1 (no unit)")
+    left.set_ylabel("t-SNE 2 (no unit)")
+    _legend_below(
+        left, [_dot(name, "o", colors[i % len(colors)]) for i, name in enumerate(phase_names)]
+    )
+    return _png(figure)
+
+
 def reach_trajectories(
     task_latent: NDArray[Any],
     episode: NDArray[np.integer[Any]],
     distance: NDArray[np.floating[Any]],
     *,
+    success_point: NDArray[Any] | None = None,
     max_episodes: int = 12,
 ) -> bytes:
     """Episodes as lines through the embedding, coloured by distance to the goal (figure 5).
@@ -165,6 +202,8 @@ def reach_trajectories(
             in the order of time; with d > 2 their first two principal components are drawn.
         episode: Episode of each transition, shape ``(N,)``.
         distance: End effector to goal, shape ``(N,)``, [m].
+        success_point: Where the task succeeds in the embedding, shape ``(d,)``: the centre of
+            circles, each as wide as the embeddings at its distance to the goal are away from it.
         max_episodes: The first so many episodes are drawn; more are hard to tell apart.
 
     Returns:
@@ -179,7 +218,10 @@ def reach_trajectories(
     drawn = np.unique(episode)[:max_episodes]
     if drawn.size == 0:
         raise BMRLError("no trajectory to draw: there is no transition")
-    points, note = _plane(task_latent)
+    # The point goes through the same projection as the transitions.
+    center = np.empty((0, np.shape(task_latent)[1])) if success_point is None else success_point
+    points, note = _plane(np.concatenate([task_latent, np.atleast_2d(center)]))
+    points, center = points[: len(task_latent)], points[len(task_latent) :]
     figure, axes = _square()
     farthest = float(distance[np.isin(episode, drawn)].max())
     for number in drawn:
@@ -198,7 +240,11 @@ def reach_trajectories(
         )
         axes.plot(*path[0], "o", color="white", markeredgecolor="black", markersize=6, zorder=3)
         axes.plot(*path[-1], "*", color="#D55E00", markeredgecolor="black", markersize=12, zorder=4)
-    figure.colorbar(dots, ax=axes, label="Distance to the goal [m]", shrink=0.85)
+    bar = figure.colorbar(dots, ax=axes, label="Distance to the goal [m]", shrink=0.85)
+    for level, radius in _level_sets(points, center, distance) if len(center) else ():
+        color = dots.to_rgba(np.array([level]))[0]
+        axes.add_patch(Circle(center[0], radius, fill=False, color=color, linewidth=1.5, zorder=2))
+        bar.ax.axhline(level, color="white", linewidth=1.0)
     _legend_below(
         axes,
         [
@@ -209,6 +255,44 @@ def reach_trajectories(
     axes.set_title(f"{len(drawn)} reach episodes in the task embedding{note}", fontsize=11)
     _name_axes(axes, note)
     return _png(figure)
+
+
+def _level_sets(
+    points: NDArray[np.float64], center: NDArray[np.float64], distance: NDArray[np.floating[Any]]
+) -> list[tuple[float, float]]:
+    """Distances to the goal [m], and how far from the center the transitions there lie."""
+    away = np.linalg.norm(points - center, axis=1)
+    edges = np.linspace(0.0, float(distance.max()), 5)
+    bands = [(distance >= low) & (distance <= high) for low, high in pairwise(edges)]
+    return [
+        (float(np.median(distance[band])), float(np.median(away[band])))
+        for band in bands
+        if band.sum() >= 3
+    ]
+
+
+def _tsne(
+    task_latent: NDArray[Any], seed: int
+) -> tuple[NDArray[np.integer[Any]], NDArray[np.float64]]:
+    """Which embeddings were drawn at random, at most 3000, and their map ``(N, 2)``."""
+    from sklearn.manifold import TSNE
+    from threadpoolctl import threadpool_limits
+
+    count = len(task_latent)
+    if count < 4:
+        raise BMRLError(f"t-SNE needs at least 4 embeddings, got {count}")
+    chosen = np.arange(count)
+    if count > 3000:
+        chosen = np.sort(np.random.default_rng(seed).choice(count, 3000, replace=False))
+    tsne = TSNE(
+        n_components=2,
+        perplexity=min(30.0, (len(chosen) - 1) / 3),
+        init="pca" if np.shape(task_latent)[1] >= 2 else "random",  # PCA keeps the overall layout
+        random_state=seed,
+    )
+    # Several threads add up in an order that changes from run to run, and so would the map.
+    with threadpool_limits(limits=1):
+        return chosen, tsne.fit_transform(np.asarray(task_latent, dtype=np.float64)[chosen])
 
 
 def _plane(task_latent: NDArray[Any]) -> tuple[NDArray[np.float64], str]:
