@@ -86,7 +86,7 @@ class DistillSettings:
     latent_norm_weight: float = 2e-3
     metric_weight: float = 0.0  # of the triplet loss on m
     metric_margin: float = 1.0
-    isometry_weight: float = 0.0  # of distances in m that are those of rewards and actions
+    isometry_weight: float = 1.0  # of distances in m that are those of rewards and actions
     normalise_qvalue: bool = True
     prototype: str = "mean"  # or medoid
 

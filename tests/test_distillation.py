@@ -238,7 +238,9 @@ def test_metric_term_needs_two_tasks() -> None:
 
 
 def test_isometry_error_compares_distances_within_a_task_alone() -> None:
+    teachers = make_teachers(TASKS)
     loss = make_distillation_loss(
+        teachers=teachers,
         isometry_weight=0.5,
         reward_scale=torch.arange(1.0, 5.0)[: batch().shape[0]],
         reduction="none",
@@ -246,8 +248,12 @@ def test_isometry_error_compares_distances_within_a_task_alone() -> None:
     data = batch()
     found = run(loss, data)["loss_isometry"]
     m = loss._encode(data.select(*loss.task_encoder.in_keys)).detach()
-    for task in range(data.shape[0]):
-        content = torch.cat([data["next", "reward"][task] / (task + 1), data["action"][task]], -1)
+    for task, generator in enumerate(teachers[0]):
+        asked = data[task].select("observation")
+        asked["action_latent"] = torch.zeros(*asked.batch_size, LATENT_DIM, dtype=m.dtype)
+        content = torch.cat(
+            [data["next", "reward"][task] / (task + 1), generator(asked)["action"]], -1
+        )
         errors = [
             [((a - b).norm() - (c - d).norm()) ** 2 for b, d in zip(m[task], content, strict=True)]
             for a, c in zip(m[task], content, strict=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams, unravel_key
@@ -51,7 +52,8 @@ class MetaDistillationLoss(KeyedLoss):
           + w_q \left(\hat Q(s, \hat g, m) - \tilde Q_i(s, g)\right)^2
           + w_m \lVert m \rVert_2^2
           + w_t \max(0, \lVert m - m^+ \rVert - \lVert m - m^- \rVert + \alpha)
-          + w_s \left(\lVert m - m^+ \rVert - \lVert c - c^+ \rVert\right)^2
+          + w_s \left(\lVert m - m^+ \rVert - \lVert c - c^+ \rVert\right)^2,
+          \quad c = (r / \rho_i, G_i(s, 0))
 
     Deviations from the paper, each of which a weight or an argument turns off: the penalty on m
     (cross-entropy alone lets m grow without bound), :math:`\tilde Q_i = (Q_i - \mu_i)/\sigma_i`
@@ -59,10 +61,10 @@ class MetaDistillationLoss(KeyedLoss):
     present transition). Off by default is the triplet loss of *Multi-task Batch Reinforcement
     Learning with Metric Learning* (https://arxiv.org/abs/1909.11373), where :math:`m^+` embeds
     another transition of the task and :math:`m^-` one of another task. Off by default, too, is
-    the last term: two transitions of a task lie as far apart in m as what they say of its progress,
-    :math:`c = (r / \rho_i, a)`, reward and action (over all pairs of a task's rows, m of the
-    present transitions). :math:`\hat Q` is trained at :math:`\hat g` without a gradient into the
-    student's generator.
+    the last term: two transitions of a task lie as far apart in m as in c, their reward and the
+    teacher's action there, so that m tells how far the task has come (over all pairs of a task's
+    rows, m of the present transitions). :math:`\hat Q` is trained at :math:`\hat g` without a
+    gradient into the student's generator.
 
     The teachers are frozen: row i of the data is task i. Any decoder and critic will do, those of
     :class:`~torchrl_bmrl.objectives.BCQLoss` and :class:`~torchrl_bmrl.objectives.PLASLoss` alike;
@@ -294,7 +296,8 @@ class MetaDistillationLoss(KeyedLoss):
         keys = [*self.task_encoder.in_keys, *self._teacher_observation_keys]
         keys.append(self.tensor_keys.task)
         if self.isometry_weight is not None:
-            keys += [key for key in self._content_keys if key not in keys]
+            reward = next_key(self.tensor_keys.reward)
+            keys += [reward] if reward not in keys else []
         if self.context == "previous":
             previous = self.tensor_keys.previous
             keys += [unravel_key((previous, key)) for key in self.task_encoder.in_keys]
@@ -313,10 +316,6 @@ class MetaDistillationLoss(KeyedLoss):
             "accuracy",
             "latent_norm",
         ]
-
-    @property
-    def _content_keys(self) -> list[NestedKey]:
-        return [next_key(self.tensor_keys.reward), self.tensor_keys.action]
 
     @property
     def _teacher_observation_keys(self) -> list[NestedKey]:
@@ -382,11 +381,13 @@ class MetaDistillationLoss(KeyedLoss):
             dtype=self.qvalue_loc.dtype,
         )
         data = data.copy().set(keys.action_latent, latent)
-        for teachers in (self.teacher_generators, self.teacher_qvalue_networks):
-            data = teachers(data, randomness=self.vmap_randomness, loop=self.deactivate_vmap)
+        data = self._ask(self.teacher_qvalue_networks, self._ask(self.teacher_generators, data))
         value = data.get(keys.state_action_value)
         value = (value - self.qvalue_loc[:, None, None]) / self.qvalue_scale[:, None, None]
         return data.set(keys.state_action_value, value)
+
+    def _ask(self, teachers: Any, data: TensorDictBase) -> TensorDictBase:
+        return teachers(data, randomness=self.vmap_randomness, loop=self.deactivate_vmap)
 
     def imitate(self, taught: TensorDictBase, task_latent: Tensor) -> Tensor:
         """Student's action for the teachers' observations and latents."""
@@ -431,9 +432,15 @@ class MetaDistillationLoss(KeyedLoss):
 
     def spread_out(self, tensordict: TensorDictBase) -> Tensor:
         """Error of each row's distances in m to its task's other rows, ``(num_tasks, B)``."""
-        # Not embed's: m of a set has no reward and action of its own.
-        reward, action = (entry(tensordict, key) for key in self._content_keys)
+        reward = entry(tensordict, next_key(self.tensor_keys.reward))
+        with torch.no_grad():
+            # What the demonstrator did, without its noise.
+            data = tensordict.select(*self._teacher_observation_keys)
+            centre = self.qvalue_loc.new_zeros(*data.batch_size, self.latent_dim)
+            data = data.copy().set(self.tensor_keys.action_latent, centre)
+            action = self._ask(self.teacher_generators, data).get(self.tensor_keys.action)
         content = torch.cat([reward / self.reward_scale[:, None, None], action], -1)
+        # Not embed's: m of a set has no reward and action of its own.
         return isometry_error(self._encode(tensordict.select(*self.task_encoder.in_keys)), content)
 
     @dispatch
