@@ -14,6 +14,7 @@ from torchrl_bmrl.reports.figures import (
 )
 from torchrl_bmrl.reports.page import Picture, Section, write_page
 from torchrl_bmrl.reports.report import read_stage1_curves, write_report
+from torchrl_bmrl.reports.studies import read_studies, write_study
 from torchrl_bmrl.reports.tables import (
     Table,
     goal_distance_table,
@@ -39,6 +40,7 @@ __all__ = [
     "measure_stages",
     "reach_trajectories",
     "read_stage1_curves",
+    "read_studies",
     "results_table",
     "stage1_curves",
     "stages_table",
@@ -47,4 +49,5 @@ __all__ = [
     "task_name",
     "write_page",
     "write_report",
+    "write_study",
 ]

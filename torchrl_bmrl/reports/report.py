@@ -33,6 +33,7 @@ from torchrl_bmrl.reports.figures import (
     stage1_curves,
 )
 from torchrl_bmrl.reports.page import Picture, Section, write_page
+from torchrl_bmrl.reports.studies import read_studies
 from torchrl_bmrl.reports.tables import (
     Table,
     goal_distance_table,
@@ -83,7 +84,7 @@ def write_report(
     Written are ``tables/{results,table1,table2}.{md,csv}``, with ``training`` also
     ``tables/{stages,goal_distance}.{md,csv}``, ``figures/*.png`` and ``report.html``, each
     atomically and after everything has been computed. A figure without data is left out, and the
-    page says so.
+    page says so. Studies that the folder holds are shown.
 
     Args:
         run_dir: The run folder, with ``results.csv`` and, for the training curves,
@@ -100,7 +101,7 @@ def write_report(
         Path of the page.
 
     Raises:
-        DataError: if ``results.csv`` or a file of training curves is missing or not valid.
+        DataError: if ``results.csv``, a file of training curves or a study is missing or not valid.
     """
     run_dir = Path(run_dir)
     summaries = summarise(read_results(run_dir / "results.csv"))
@@ -148,6 +149,7 @@ def write_report(
                 tables=list(known.values()),
                 pictures=list(drawn.values()),
             ),
+            *read_studies(run_dir),
             Section(heading="Everything measured", tables=[tables["results"]]),
         ],
     )
