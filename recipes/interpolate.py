@@ -119,8 +119,10 @@ class Explorer(TensorDictModuleBase):
 # -- where m goes ----------------------------------------------------------------------------------
 
 
-def training_embeddings(config: Config, student: Student, task: str, count: int) -> np.ndarray:
-    """Embeddings of a task's training transitions, ``(N, m)``, at most ``count``, at random."""
+def training_embeddings(
+    config: Config, student: Student, task: str, count: int | None = None
+) -> np.ndarray:
+    """Embeddings of a task's training transitions, ``(N, m)``: all, or so many at random."""
     data_dir = Path(config.run_dir) / "data"
     statistics = read_statistics(data_dir)
     data = load_transitions(
@@ -159,9 +161,7 @@ def embedding_points(
         names = [config.tasks[i % len(config.tasks)] for i in range(count)]
         return np.stack([prototypes[name] for name in names])[:, None], unknown, names
     if method == "random":
-        data = np.concatenate(
-            [training_embeddings(config, student, t, HORIZON * 100) for t in config.tasks]
-        )
+        data = np.concatenate([training_embeddings(config, student, t) for t in config.tasks])
         rng = np.random.default_rng(derive_seed(config.seed, "interpolate", "random"))
         points = rng.uniform(data.min(0), data.max(0), (count, data.shape[1]))
         return points[:, None], unknown, [""] * count

@@ -907,7 +907,8 @@ def test_interpolation_plays_every_method_beside_what_it_is_compared_with(
     size, noise = (sum(column(name, "deviation")) for name in ("straight", "straight_noise"))
     assert noise == pytest.approx(size, rel=0.3)
     assert column("straight", "along")[::HORIZON] == [0.25, 0.5, 0.75, 1.0]
-    assert column("curve_moving", "along")[:2] == [0.0, pytest.approx(1 / 199, abs=1e-4)]
+    step = pytest.approx(1 / (HORIZON - 1), abs=1e-4)
+    assert column("curve_moving", "along")[:2] == [0.0, step]
 
     for name, lines in (("interpolation", len(interpolate.METHODS) + 2), ("switching", 3)):
         table = (tmp_path / "tables" / f"{name}.csv").read_text().splitlines()
