@@ -17,6 +17,7 @@ import os
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 import csv
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -338,6 +339,18 @@ def with_interval(values: np.ndarray, form: str) -> str:
     return f"{values.mean():{form}} [{low:{form}}, {high:{form}}]"
 
 
+def share_of_neither(config: Config, episodes: Mapping[str, np.ndarray], tasks: Mapping) -> str:
+    """Share of episodes in which the cube fares as at neither end of the episode's path."""
+    labels = list(zip(tasks["label"], cube_outcomes(moved(tasks, "cube")), strict=True))
+    usual = {
+        task: Counter(outcome for label, outcome in labels if label == task).most_common(1)[0][0]
+        for task in {label for label, _ in labels}
+    }
+    ends = {task: (usual[config.interpolation.task], usual[task]) for task in usual}
+    outcomes = zip(episodes["label"], cube_outcomes(moved(episodes, "cube")), strict=True)
+    return f"{np.mean([outcome not in ends[label] for label, outcome in outcomes]):.0%}"
+
+
 def method_table(config: Config, played: Mapping[str, dict[str, np.ndarray]]) -> Table:
     """Behaviour of every method, one line each."""
     group = min(GROUP, config.interpolation.episodes)
@@ -362,9 +375,11 @@ def method_table(config: Config, played: Mapping[str, dict[str, np.ndarray]]) ->
             shares = {kind: outcomes.count(kind) / len(outcomes) for kind in CUBE_OUTCOMES}
             line += [with_interval(covered, ".0f"), f"{1 - shares['still']:.0%}"]
             line += [f"{effective_number(outcomes):.1f}"]
+            between = name in ("straight", "curve", "curve_moving")
+            line += [share_of_neither(config, episodes, played["tasks"]) if between else MISSING]
             line += [", ".join(f"{kind} {x:.0%}" for kind, x in shares.items() if x)]
         else:
-            line += [MISSING] * 4
+            line += [MISSING] * 5
         lines.append(line)
     return Table(
         title=f"Interpolation as exploration, in the scene of {config.interpolation.task}",
@@ -374,13 +389,15 @@ def method_table(config: Config, played: Mapping[str, dict[str, np.ndarray]]) ->
             f"positions relative to the episode's start; “cells of {group}” are those that "
             f"{group} episodes occupy together. New: cells of all episodes in which no episode of "
             "any task's prototype was. Spread: root mean square distance of the final "
-            "end-effector positions from their mean. Kinds: effective number of outcomes. "
+            "end-effector positions from their mean. Kinds: effective number of outcomes, of what "
+            f"may become of the cube: {', '.join(CUBE_OUTCOMES)}. Neither: episodes with an "
+            "outcome that is usual at neither end of their path. "
             "Brackets: 95% bootstrap intervals over episodes, or over groups."
         ),
         header=(
             "Method", "Episodes", "Size", f"Cells of {group}", "Cells of all", "New",
             "Spread [m]", "Speed [m/s]", f"Cube's cells of {group}", "Cube moved", "Kinds",
-            "Outcomes",
+            "Neither", "Outcomes",
         ),
         rows=lines,
     )  # fmt: skip
@@ -446,6 +463,11 @@ def interpolate(config: Config) -> None:
     if task not in config.tasks or len(config.tasks) < 2:
         raise ConfigError(
             f"interpolation.task is {task}; valid: one of tasks, {config.tasks}, beside others"
+        )
+    if config.interpolation.episodes < len(config.tasks):
+        raise ConfigError(
+            f"interpolation.episodes is {config.interpolation.episodes}; valid: at least one for "
+            f"each of the {len(config.tasks)} tasks"
         )
     names = list(METHODS)
     switching = "reach" in config.tasks and config.collect.valid_episodes > 1

@@ -926,6 +926,32 @@ def test_interpolation_plays_every_method_beside_what_it_is_compared_with(
     assert contents(tmp_path, "interpolation/**/*", "tables/*", "figures/*") == before
     again = {path.stem for path in folder.iterdir() if path.stat().st_mtime_ns != written[path]}
     assert again == {"straight", "straight_noise"}
-    with pytest.raises(SystemExit):
-        run(tmp_path, interpolate.interpolate, *options, "interpolation.task=push_up")
-    assert "interpolation.task is push_up; valid: one of tasks" in capsys.readouterr().err
+    for option, says in (
+        ("interpolation.task=push_up", "interpolation.task is push_up; valid: one of tasks"),
+        ("interpolation.episodes=1", "interpolation.episodes is 1; valid: at least one for each"),
+    ):
+        with pytest.raises(SystemExit):
+            run(tmp_path, interpolate.interpolate, *options, option)
+        assert says in capsys.readouterr().err
+
+
+def test_an_outcome_counts_as_neither_when_no_end_of_the_path_has_it(recipes: Any) -> None:
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    pytest.importorskip("matplotlib")
+    import interpolate
+
+    config = OmegaConf.to_object(configured("preset=smoke", "run_dir=run"))
+    ends = {"lift": (0, 0, 0.1), "push_up": (0.1, 0, 0), "reach": (0, 0, 0)}
+
+    def episodes(*labelled: tuple[str, tuple[float, ...]]) -> dict[str, Any]:
+        cube = torch.zeros(len(labelled), 2, 3).numpy()
+        for i, (_, end) in enumerate(labelled):
+            cube[i, -1] = end
+        return {"cube": cube, "label": [label for label, _ in labelled]}
+
+    # One push that failed does not make "still" usual.
+    tasks = episodes(*ends.items(), *ends.items(), ("push_up", (0, 0, 0)))
+    lift, up, still = ends.values()
+    between = [("push_up", lift), ("push_up", up), ("push_up", still), ("reach", up)]
+    share = interpolate.share_of_neither(config, episodes(*between), tasks)
+    assert share == "50%"
