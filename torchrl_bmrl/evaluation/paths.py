@@ -54,7 +54,7 @@ def data_path(
     so that many short hops, where data is dense, beat one long hop across a gap. Unlike on a graph
     of nearest neighbours there always is such a path, and no number of neighbours to choose.
 
-    Reference: Bijral et al. 2011, *Semi-supervised learning with density based distances*,
+    Reference: Bijral et al. 2012, *Semi-supervised learning with density based distances*,
     https://arxiv.org/abs/1202.3702.
 
     Args:
