@@ -74,8 +74,8 @@ SWITCHES = {
     "switch": "Another one from halfway on",
     "leave": "Another task's prototype from halfway on",
 }
-SWITCH_STEPS = 10
-"""Steps of the straight line between two demonstrations."""
+SWITCH_STEPS = 3
+"""Steps of the straight line between two demonstrations; a reach arrives after about eleven."""
 CELL = 0.04
 """Edge of the cells that are counted [m]."""
 GROUP = 5
@@ -410,6 +410,7 @@ def switching_table(played: Mapping[str, dict[str, np.ndarray]]) -> Table:
         success = episodes["success"].astype(bool)
         leaving = episodes["label"].astype(int)
         early = [success[i, : leaving[i]].any() for i in range(len(success))]
+        apart = np.linalg.norm(episodes["eef"] - played["stay"]["eef"], axis=-1)
         first = success.argmax(1)[success.any(1)] / CONTROL_FREQUENCY
         lines.append(
             [
@@ -419,6 +420,7 @@ def switching_table(played: Mapping[str, dict[str, np.ndarray]]) -> Table:
                 with_interval(success[:, -1].astype(float), ".2f"),
                 str(sum(early)),
                 f"{np.median(first):.2f}" if len(first) else MISSING,
+                f"{apart.max(1).mean():.4f}",
             ]
         )
     return Table(
@@ -427,11 +429,16 @@ def switching_table(played: Mapping[str, dict[str, np.ndarray]]) -> Table:
             "Reach episodes from new starts to new goals, driven by the embeddings of held-out "
             f"demonstrations; halfway to the first one's success m goes in {SWITCH_STEPS} steps "
             "along a straight line to the second one's. Arrived: within 2 cm of the episode's own "
-            "goal at some step; there: at the last one. Brackets: 95% bootstrap intervals."
+            "goal at some step; there: at the last one. Apart: the end-effector's largest distance "
+            "from where it is without leaving, mean over episodes; where that is next to nothing, "
+            "two demonstrations are one behaviour. Brackets: 95% bootstrap intervals."
         ),
-        header=("m", "Episodes", "Arrived", "There at the end", "Arrived before", "After [s]"),
+        header=(
+            "m", "Episodes", "Arrived", "There at the end", "Arrived before", "After [s]",
+            "Apart [m]",
+        ),
         rows=lines,
-    )
+    )  # fmt: skip
 
 
 def draw(config: Config, played: Mapping[str, dict[str, np.ndarray]], target: Path) -> None:
