@@ -124,6 +124,14 @@ class ImitateSettings:
 
 
 @dataclass
+class InterpolationSettings:
+    """Exploration between the tasks' embeddings (interpolate.py)."""
+
+    task: str = "lift"  # whose scene, and whose prototype the paths start from
+    episodes: int = 50  # of each method
+
+
+@dataclass
 class Config:
     """Everything that decides a run; ``config.yaml`` in the run folder is one of these."""
 
@@ -144,6 +152,7 @@ class Config:
     evaluate: EvaluateSettings = field(default_factory=EvaluateSettings)
     human: HumanSettings = field(default_factory=HumanSettings)
     imitate: ImitateSettings = field(default_factory=ImitateSettings)
+    interpolation: InterpolationSettings = field(default_factory=InterpolationSettings)
 
 
 POSITIVE = (
@@ -170,6 +179,7 @@ POSITIVE = (
     "imitate.demonstrations",
     "imitate.episodes",
     "imitate.cloning_updates",
+    "interpolation.episodes",
 )
 CHOICES = {
     "logger": LOGGERS,
@@ -188,7 +198,7 @@ def check_settings(config: Config) -> None:
     Raises:
         BMRLError: naming the key, its value and what is valid.
     """
-    for task in [*config.tasks, *config.collect.train_episodes]:
+    for task in [*config.tasks, *config.collect.train_episodes, config.interpolation.task]:
         check_task(task)
     missing = [task for task in config.tasks if task not in config.collect.train_episodes]
     if not config.tasks or missing or len(set(config.tasks)) < len(config.tasks):

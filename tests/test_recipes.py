@@ -144,6 +144,8 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
         ("device=gpu", "device is 'gpu'; valid: one that torch can use"),
         ("bcq.eval_episodes=0", "bcq.eval_episodes is 0"),
         ("evaluate.episodes=-1", "evaluate.episodes is -1"),
+        ("interpolation.episodes=0", "interpolation.episodes is 0"),
+        ("interpolation.task=lfit", "unknown task 'lfit'"),
         ("checkpoint_interval=0", "checkpoint_interval is 0"),
     ],
 )
@@ -856,3 +858,100 @@ def test_imitation_names_what_is_wrong_and_writes_no_study(
         recipes.run_recipe(settings, imitate.imitate)
     assert says in capsys.readouterr().err
     assert not (tmp_path / "imitation").exists()
+
+
+# -- interpolation ---------------------------------------------------------------------------------
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_interpolation_plays_every_method_beside_what_it_is_compared_with(
+    run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("sklearn")
+    import collect
+    import distill
+    import interpolate
+    import train_bcq
+
+    from torchrl_bmrl.evaluation import rollout
+
+    monkeypatch.setitem(rollout.rollout_episodes.__kwdefaults__, "max_steps", HORIZON)
+    options = ["collect.valid_episodes=2", "distill.task_latent_dim=3", "interpolation.episodes=4"]
+    for stage in (collect.collect, train_bcq.train_all, distill.distill, interpolate.interpolate):
+        run(tmp_path, stage, *options)
+
+    folder = tmp_path / "interpolation" / "lift-4"
+    rows = {path.stem: list(csv.DictReader(path.open())) for path in folder.glob("*.csv")}
+    noises = {f"{name}_noise" for name in interpolate.WITH_NOISE}
+    assert set(rows) == {*interpolate.METHODS, *noises, *interpolate.SWITCHES}
+    assert {len(part) for part in rows.values()} == {4 * HORIZON}
+
+    def column(name: str, field: str) -> list[float]:
+        return [float(row[field]) for row in rows[name]]
+
+    # Lift starts 10 cm above the cube, whatever the method, from the same places.
+    for name in set(rows) - set(interpolate.SWITCHES):
+        starts = [row for row in rows[name] if row["step"] == "0"]
+        for row, expected in zip(starts, rows["prototype"][::HORIZON], strict=True):
+            assert float(row["eef_z"]) - float(row["goal_z"]) == pytest.approx(0.1, abs=1e-3)
+            assert float(row["eef_x"]) == pytest.approx(float(row["goal_x"]), abs=1e-3)
+            assert row["goal_x"] == expected["goal_x"]
+    # The same m and the same proposals are the same action; another m is another.
+    assert set(column("prototype", "deviation")) == {0.0}
+    assert sum(column("straight", "deviation")) > 0
+    size, noise = (sum(column(name, "deviation")) for name in ("straight", "straight_noise"))
+    assert noise == pytest.approx(size, rel=0.3)
+    assert column("straight", "along")[::HORIZON] == [0.25, 0.5, 0.75, 1.0]
+    step = pytest.approx(1 / (HORIZON - 1), abs=1e-4)
+    assert column("curve_moving", "along")[:2] == [0.0, step]
+
+    for name, lines in (("interpolation", len(interpolate.METHODS) + 2), ("switching", 3)):
+        table = (tmp_path / "tables" / f"{name}.csv").read_text().splitlines()
+        assert len(table) == 1 + lines
+        page = (tmp_path / "tables" / f"{name}.md").read_text()
+        assert f"\n| {table[1].split(',')[0]} | 4 |" in page
+    for name in ("trajectories", "paths"):
+        picture = tmp_path / "figures" / f"interpolation_{name}.png"
+        assert picture.read_bytes()[1:4] == b"PNG"
+
+    before = contents(tmp_path, "interpolation/**/*", "tables/*", "figures/*")
+    written = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+    (folder / "straight_noise.csv").unlink()
+    run(tmp_path, interpolate.interpolate, *options)
+    assert contents(tmp_path, "interpolation/**/*", "tables/*", "figures/*") == before
+    again = {path.stem for path in folder.iterdir() if path.stat().st_mtime_ns != written[path]}
+    assert again == {"straight", "straight_noise"}
+    for option, says in (
+        ("interpolation.task=push_up", "interpolation.task is push_up; valid: one of tasks"),
+        ("interpolation.episodes=1", "interpolation.episodes is 1; valid: at least one for each"),
+    ):
+        with pytest.raises(SystemExit):
+            run(tmp_path, interpolate.interpolate, *options, option)
+        assert says in capsys.readouterr().err
+
+
+def test_an_outcome_counts_as_neither_when_no_end_of_the_path_has_it(recipes: Any) -> None:
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    pytest.importorskip("matplotlib")
+    import interpolate
+
+    config = OmegaConf.to_object(configured("preset=smoke", "run_dir=run"))
+    ends = {"lift": (0, 0, 0.1), "push_up": (0.1, 0, 0), "reach": (0, 0, 0)}
+
+    def episodes(*labelled: tuple[str, tuple[float, ...]]) -> dict[str, Any]:
+        cube = torch.zeros(len(labelled), 2, 3).numpy()
+        for i, (_, end) in enumerate(labelled):
+            cube[i, -1] = end
+        return {"cube": cube, "label": [label for label, _ in labelled]}
+
+    # One push that failed does not make "still" usual.
+    tasks = episodes(*ends.items(), *ends.items(), ("push_up", (0, 0, 0)))
+    lift, up, still = ends.values()
+    between = [("push_up", lift), ("push_up", up), ("push_up", still), ("reach", up)]
+    share = interpolate.share_of_neither(config, episodes(*between), tasks)
+    assert share == "50%"

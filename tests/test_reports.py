@@ -43,6 +43,7 @@ from torchrl_bmrl.reports import (
     write_page,
     write_report,
 )
+from torchrl_bmrl.reports.figures import behaviour_trajectories, embedding_paths
 
 ARMS = [("expert", ""), ("bcq", ""), ("distilled", "prototype"), ("distilled", "online")]
 
@@ -248,6 +249,10 @@ def test_figures_repeat_exactly_and_change_with_the_data() -> None:
         lambda m: reach_trajectories(m, data.episode, data.distance, success_point=m[0]),
         lambda m: embedding_stages(m, data.phase, data.step // 3, ("a", "b", "c")),
         lambda m: stage1_curves({"lift": curve}, expert_means={"lift": float(m.sum())}),
+        lambda m: embedding_paths(m, data.task, {"straight": [m[:5]], "curve": [m[3:7]]}, m[:2]),
+        lambda m: behaviour_trajectories(
+            {"line": np.tile(m, (1, 1, 2))[..., :3]}, {"line": m[:1, :1]}
+        ),
     ]
     for draw in draws:
         image = draw(data.task_latent)
@@ -279,6 +284,7 @@ def test_embeddings_of_other_sizes_are_drawn(dim: int) -> None:
             data.task_latent, data.episode, data.distance, success_point=data.task_latent[0]
         ),
         embedding_stages(data.task_latent[:40], data.phase[:40], data.phase[:40], ("a", "b", "c")),
+        embedding_paths(data.task_latent, data.task, {"curve": [data.task_latent]}, np.eye(1, dim)),
     ):
         assert image.startswith(b"\x89PNG")
 
@@ -292,6 +298,8 @@ def test_figures_refuse_what_they_cannot_draw() -> None:
         embedding_tsne(np.zeros((3, 2)), np.zeros(3, dtype=int))
     with pytest.raises(BMRLError, match="no trajectory"):
         reach_trajectories(np.zeros((0, 2)), np.zeros(0, dtype=int), np.zeros(0))
+    with pytest.raises(BMRLError, match="no trajectory"):
+        behaviour_trajectories({}, {})
 
 
 def test_embeddings_refuse_what_does_not_fit() -> None:

@@ -17,6 +17,7 @@ from torchrl_bmrl.modules.policy import (
 from torchrl_bmrl.modules.task_latent import (
     DemonstrationTaskLatent,
     OnlineTaskLatent,
+    PathTaskLatent,
     PrototypeTaskLatent,
     StageTaskLatent,
     make_task_classifier,
@@ -31,6 +32,7 @@ __all__ = [
     "DiscreteBCQPolicy",
     "OnlineTaskLatent",
     "PLASPolicy",
+    "PathTaskLatent",
     "PrototypeTaskLatent",
     "StageTaskLatent",
     "extract_critic",

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
@@ -380,3 +382,97 @@ def _png(figure: Figure) -> bytes:
     # Without this the file names matplotlib's version, and equal pictures differ.
     figure.savefig(data, format="png", dpi=_DPI, metadata={"Software": None})
     return data.getvalue()
+
+
+def behaviour_trajectories(
+    positions: Mapping[str, NDArray[Any]], along: Mapping[str, NDArray[Any]]
+) -> bytes:
+    """End-effector trajectories of several methods, from above and from the side.
+
+    Args:
+        positions: By the method's name, relative to each episode's start, shape ``(N, T, 3)`` [m].
+        along: How far along its path m was, 0 to 1, shape ``(N, 1)`` or ``(N, T)``; where it is
+            not a number, the trajectory is grey.
+
+    Returns:
+        PNG image.
+
+    Example:
+        >>> line = np.linspace(0.0, 0.1, 12).reshape(2, 2, 3)
+        >>> behaviour_trajectories({"straight": line}, {"straight": np.array([[0.5], [1.0]])})[1:4]
+        b'PNG'
+    """
+    if not positions:
+        raise BMRLError("no trajectory to draw: there is no method")
+    count = len(positions)
+    figure = Figure(figsize=(max(2.4 * count, 5.0), 5.2), layout="constrained")
+    panels = figure.subplots(2, count, squeeze=False, sharex="row", sharey="row")
+    norm = Normalize(0, 1)
+    for column, (name, paths) in enumerate(positions.items()):
+        x, y, z = np.moveaxis(np.asarray(paths, dtype=np.float64), -1, 0)
+        color = np.broadcast_to(along[name][:, : x.shape[1]], x.shape)
+        known = np.isfinite(color)
+        # From above with the robot at the bottom: its left, +y, is to the left.
+        for axes, a, b in ((panels[0, column], y, x), (panels[1, column], y, z)):
+            axes.scatter(a[~known], b[~known], color=_GREY, s=2, alpha=0.4, linewidths=0)
+            axes.scatter(a[known], b[known], c=color[known], norm=norm, s=2, linewidths=0)
+            axes.plot(0, 0, "+", color="black", markersize=8)
+            axes.set_aspect("equal")
+            _tidy(axes)
+        panels[0, column].set_title(name, fontsize=10)
+        panels[1, column].set_xlabel("to the left [m]", fontsize=9)
+    for axes in panels[:, 0]:
+        axes.invert_xaxis()  # shared along the row
+    panels[0, 0].set_ylabel("from above: away [m]", fontsize=9)
+    panels[1, 0].set_ylabel("from behind: up [m]", fontsize=9)
+    figure.colorbar(
+        ScalarMappable(norm), ax=panels, label="Position along the interpolation", shrink=0.7
+    )
+    return _png(figure)
+
+
+def embedding_paths(
+    task_latent: NDArray[Any],
+    task: NDArray[np.integer[Any]],
+    paths: Mapping[str, Sequence[NDArray[Any]]],
+    points: NDArray[Any],
+) -> bytes:
+    """The embedding with paths through it: straight ones dashed, others solid.
+
+    Args:
+        task_latent: Embeddings m of transitions, shape ``(N, d)``; with d > 2 the first two
+            principal components of everything shown are drawn.
+        task: Class index of each transition, shape ``(N,)``.
+        paths: By kind, ``"straight"`` or another, shape ``(P, d)`` each.
+        points: Single points of m, shape ``(K, d)``.
+
+    Returns:
+        PNG image.
+
+    Example:
+        >>> paths = {"straight": [np.eye(2, 2)]}
+        >>> embedding_paths(np.eye(3, 2), np.array([0, 1, 5]), paths, np.zeros((1, 2)))[1:4]
+        b'PNG'
+    """
+    flat = [(kind, path) for kind, some in paths.items() for path in some]
+    parts = [task_latent, points, *(path for _, path in flat)]
+    plane, note = _plane(np.concatenate(parts))
+    drawn = np.split(plane, np.cumsum([len(part) for part in parts])[:-1])
+    figure, axes = _square()
+    _scatter_by_task(axes, drawn[0], task)
+    axes.plot(*drawn[1].T, "x", color="black", markersize=4, label="random points")
+    for (kind, _), path in zip(flat, drawn[2:], strict=True):
+        style = "--" if kind == "straight" else "-"
+        axes.plot(*path.T, style, color="black", linewidth=1.2)
+        axes.plot(*path[-1], "s", color="white", markeredgecolor="black", markersize=6, zorder=4)
+    if flat:
+        axes.plot(
+            *drawn[2][0], "*", color="white", markeredgecolor="black", markersize=13, zorder=5
+        )
+    axes.set_title(
+        "Paths through the embedding: straight (dashed), on the data (solid);\n"
+        f"from the star to the squares, prototypes; crosses: random points{note}",
+        fontsize=10,
+    )
+    _name_axes(axes, note)
+    return _png(figure)
