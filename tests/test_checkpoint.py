@@ -161,6 +161,15 @@ def test_a_student_comes_back_with_its_prototypes(path: Path) -> None:
     assert same(dict(student.state_dict()), dict(again.state_dict()))
 
 
+def test_a_student_without_an_encoder_is_refused_by_the_missing_key(path: Path) -> None:
+    options = {**SMALL, "num_tasks": 3, "latent_dim": 4}
+    state = Student(**options).state_dict()
+    rest = {key: value for key, value in state.items() if not key.startswith("task_encoder")}
+    save_checkpoint(path, {"student": rest}, {"kind": "student", "student": options})
+    with pytest.raises(CheckpointError, match="task_encoder"):
+        load_student(path)
+
+
 def test_a_second_save_replaces_the_first(path: Path) -> None:
     save_checkpoint(path, {"a": torch.ones(100), "b": 1}, META)
     save_checkpoint(path, {"a": torch.zeros(2)}, META)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -589,6 +590,24 @@ def test_a_demonstration_that_cannot_drive_is_refused(
 ) -> None:
     with pytest.raises(BMRLError, match=says):
         DemonstrationTaskLatent(demonstration()[:rows], encoder, **options)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda d: d.exclude(("next", "reward")), r"has no \('next', 'reward'\); valid: \["),
+        (lambda d: d.set("observation", torch.zeros(7, 9)), r"'observation': \(7, 9\)"),
+        (lambda d: d.set("action", torch.zeros(7, 1)), r"'action': \(7, 1\)"),
+        (lambda d: d.set("stage", torch.tensor([0, 1, 0, 1, 1, 1, 1])), "never goes back"),
+        (lambda d: d.set("stage", d["stage"] - 1), "from 0 on"),
+    ],
+    ids=["no reward", "other observation", "other action", "stages go back", "negative stage"],
+)
+def test_a_demonstration_of_another_layout_is_refused(
+    change: Callable[[TensorDict], TensorDict], says: str, encoder: TensorDictModule
+) -> None:
+    with pytest.raises(BMRLError, match=says):
+        DemonstrationTaskLatent(change(staged()), encoder)
 
 
 def test_the_stage_chooses_among_points() -> None:

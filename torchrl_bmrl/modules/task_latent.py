@@ -186,6 +186,24 @@ ALIGNMENTS = ("time", "state", "progress")
 """How a demonstration's embeddings follow an episode; see :class:`DemonstrationTaskLatent`."""
 
 
+@torch.no_grad()
+def _embed(demonstration: TensorDictBase, encoder: TensorDictModule) -> Tensor:
+    """Embeddings of a demonstration's transitions, ``(T, m)``."""
+    shapes = {}
+    for key in TRANSITION_KEYS:
+        value = demonstration.get(key, None)
+        if value is None:
+            raise BMRLError(f"the demonstration has no {key!r}; valid: {list(TRANSITION_KEYS)}")
+        shapes[key] = tuple(value.shape)
+    try:
+        return encoder(demonstration.select(*TRANSITION_KEYS)).get("task_latent")
+    except RuntimeError as error:
+        raise BMRLError(
+            f"the demonstration's shapes are {shapes}; valid: those that the encoder was trained "
+            f"on ({error})"
+        ) from error
+
+
 class DemonstrationTaskLatent(PrototypeTaskLatent):
     """Writes the embeddings of one demonstration.
 
@@ -205,7 +223,8 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
         window: transitions that progress may advance at a step.
 
     Raises:
-        BMRLError: for another alignment, an empty demonstration or a window below one.
+        BMRLError: for another alignment, a window below one, or a demonstration that is empty,
+            lacks a key, has stages that go back, or sizes that the encoder does not take.
     """
 
     def __init__(
@@ -222,8 +241,7 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
             raise BMRLError("a demonstration of 0 transitions; valid: at least one")
         if window < 1:
             raise BMRLError(f"window is {window}; valid: at least 1")
-        with torch.no_grad():
-            latents = encoder(demonstration.select(*TRANSITION_KEYS)).get("task_latent")
+        latents = _embed(demonstration, encoder)
         super().__init__(latents[0])
         self.alignment = alignment
         self.window = window
@@ -233,6 +251,11 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
         stages = demonstration.get("stage", None)
         if stages is None:
             stages = torch.zeros(len(latents), dtype=torch.int64)
+        if stages.shape != latents.shape[:1] or (stages.diff() < 0).any() or stages[0] < 0:
+            raise BMRLError(
+                f"stage of the demonstration is {stages.tolist()}; valid: a number for each of its "
+                f"{len(latents)} transitions, from 0 on, that never goes back"
+            )
         # Where each stage begins, and the end.
         number = torch.arange(int(stages.max()) + 2)
         self.register_buffer("first", torch.searchsorted(stages.contiguous(), number))
