@@ -8,6 +8,7 @@ from torchrl_bmrl.reports.figures import (
     embedding_tsne,
     reach_trajectories,
     stage1_curves,
+    success_curves,
 )
 from torchrl_bmrl.reports.page import Picture, Section, write_page
 from torchrl_bmrl.reports.report import Embeddings, read_stage1_curves, write_report
@@ -25,6 +26,7 @@ __all__ = [
     "read_stage1_curves",
     "results_table",
     "stage1_curves",
+    "success_curves",
     "table_1",
     "table_2",
     "task_name",
