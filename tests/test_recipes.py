@@ -854,7 +854,7 @@ def test_steps_to_half_are_those_of_the_first_evaluation_that_reaches_it(recipes
 
     assert latent_sac.steps_to_half(agent(0.0, 0.4, 0.5, 0.3, 0.9)) == 200
     assert latent_sac.steps_to_half(agent(0.0, 0.4)) is None
-    config = OmegaConf.to_object(configured("preset=smoke"))
+    config = OmegaConf.to_object(configured("preset=smoke", "run_dir=run"))
     table = latent_sac.make_table(config, [agent(0.0, 0.6, 0.2), agent(0.1, 0.4)])
     assert table.rows[0] == ("latent", "3", "100", "0%", "60%", "20%", "0.4")
     assert table.rows[1][2] == "not within 20,000"
