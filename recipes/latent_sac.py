@@ -174,7 +174,7 @@ def train_job(job: Job, report: Report) -> list[Row]:
                 updates += 1
             if steps >= len(rows) * settings.eval_interval:
                 if updates:
-                    check_finite(losses, f"{variant}, seed {seed}, step {steps}")
+                    check_finite(losses.detach(), f"{variant}, seed {seed}, step {steps}")
                 rows.append(evaluate(config, loss, eval_env, variant, seed, steps))
             if steps >= settings.environment_steps:
                 break
