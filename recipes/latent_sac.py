@@ -5,8 +5,8 @@
 
 TorchRL's SAC on a composition that rewards nothing but its stages, +1 for each: once with m as its
 action, held for ``hold`` steps, and once with the robot's own. Networks, learning rates, steps of
-the environment, updates per step and discount per step are the same. Agents that are done are kept
-and skipped; one that was stopped starts over.
+the environment, updates per step and discount per step are the same. Rows are kept as they come;
+agents that are done are skipped the next time, one that was stopped starts over.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def make_agent_env(config: Config, variant: str, num_envs: int, *, stop: bool) -
     if variant == "latent":
         student, metadata = load_student(run_dir / "distill" / "checkpoint.safetensors")
         policy = student.policy(
-            num_candidates=config.evaluate.num_candidates, latent_clip=metadata["latent_clip"]
+            num_candidates=settings.num_candidates, latent_clip=metadata["latent_clip"]
         )
         embeddings = [
             student.embed(
@@ -134,9 +134,11 @@ def train_job(job: Job, report: Report) -> list[Row]:
     settings = config.latent_sac
     path = output_dir(config) / f"{variant}-seed{seed}.csv"
     if path.exists():
-        report(settings.environment_steps)
         with path.open(newline="") as file:
-            return list(csv.DictReader(file))
+            kept: list[Row] = list(csv.DictReader(file))
+        if int(kept[-1]["environment_steps"]) >= settings.environment_steps:
+            report(settings.environment_steps)
+            return kept
     hold = settings.hold if variant == "latent" else 1
     torch.manual_seed(derive_seed(seed, "latent_sac", variant))
     env = make_agent_env(config, variant, NUM_ENVS, stop=True)
@@ -172,14 +174,15 @@ def train_job(job: Job, report: Report) -> list[Row]:
                 optimizer.step()
                 targets.step()
                 updates += 1
-            if steps >= len(rows) * settings.eval_interval:
+            last = steps >= settings.environment_steps
+            if last or steps >= len(rows) * settings.eval_interval:
                 if updates:
                     check_finite(losses.detach(), f"{variant}, seed {seed}, step {steps}")
                 rows.append(evaluate(config, loss, eval_env, variant, seed, steps))
-            if steps >= settings.environment_steps:
+                write_rows(path, rows)
+            if last:
                 break
         collector.shutdown(close_env=False)
-    write_rows(path, rows)
     return rows
 
 

@@ -128,6 +128,7 @@ class LatentSACSettings:
 
     composition: str = "reach-lift"
     hold: int = 20  # steps of the environment that a chosen m is held
+    num_candidates: int = 20  # of the frozen policy, which acts at every step
     environment_steps: int = 20_000  # of each agent
     random_steps: int = 1_000  # the first of these, without updates
     seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
@@ -184,6 +185,7 @@ POSITIVE = (
     "imitate.episodes",
     "imitate.cloning_updates",
     "latent_sac.hold",
+    "latent_sac.num_candidates",
     "latent_sac.environment_steps",
     "latent_sac.eval_interval",
     "latent_sac.eval_episodes",

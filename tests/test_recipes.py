@@ -781,6 +781,7 @@ SAC = (
     "latent_sac.random_steps=100",
     "latent_sac.eval_interval=200",
     "latent_sac.eval_episodes=2",
+    "latent_sac.num_candidates=3",
 )
 
 
@@ -798,12 +799,14 @@ def test_sac_learns_on_top_of_a_finished_run_and_keeps_every_agent(
     kept = folder / "latent_sac" / "reach-lift-hold5"
     with (kept / "results.csv").open() as file:
         rows = list(csv.DictReader(file))
-    # Chunks of 20 steps in five environments; evaluated before, at 200 and, beyond 250, no more.
+    # Chunks of 20 steps in five environments; evaluated before, from 200 on and at the end.
     assert [(row["variant"], row["environment_steps"]) for row in rows] == [
         ("latent", "0"),
         ("latent", "200"),
+        ("latent", "300"),
         ("raw", "0"),
         ("raw", "200"),
+        ("raw", "300"),
     ]
     assert all(0 <= float(row["success"]) <= 1 and 0 <= float(row["stages"]) <= 2 for row in rows)
     table = (folder / "tables" / "latent_sac-reach-lift-hold5.md").read_text()
@@ -818,7 +821,7 @@ def test_sac_learns_on_top_of_a_finished_run_and_keeps_every_agent(
     assert len(contents(kept, "*-seed*.csv")) == 2 * len(agents) == 4
     capsys.readouterr()
     with pytest.raises(SystemExit):
-        run(folder, latent_sac.latent_sac, *SAC[:-1], "latent_sac.eval_episodes=3")
+        run(folder, latent_sac.latent_sac, *SAC, "latent_sac.eval_episodes=3")
     assert "eval_episodes is 3 here and 2 in the folder's run" in capsys.readouterr().err
 
 
