@@ -204,8 +204,8 @@ def evaluate(
         "variant": variant,
         "seed": seed,
         "environment_steps": steps,
-        "success": episodes["next", "success"].any(-1).float().mean().item(),
-        "stages": episodes["next", "stage"].amax(-1).float().mean().item(),
+        "success": episodes["next", "success"].any(-1).double().mean().item(),
+        "stages": episodes["next", "stage"].amax(-1).double().mean().item(),
     }
 
 

@@ -242,7 +242,7 @@ def success_curves(curves: Mapping[str, Sequence[NDArray[Any]]], *, title: str) 
     axes.set_xlabel("Steps of the environment")
     axes.set_ylabel("Success rate")
     axes.set_title(title, fontsize=11)
-    axes.legend(frameon=False, fontsize=9)
+    figure.legend(loc="outside lower center", ncols=len(curves), frameon=False, fontsize=9)
     return _png(figure)
 
 
