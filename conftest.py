@@ -18,7 +18,7 @@ torch.set_num_threads(1)
 
 # Modules whose import, and so their docstrings' examples, needs an extra.
 _NEEDS = {
-    "gymnasium": ["torchrl_bmrl/envs/*"],
+    "gymnasium": ["torchrl_bmrl/envs/*", "torchrl_bmrl/reports/films.py"],
     "h5py": [
         *(
             f"torchrl_bmrl/data/{name}.py"
@@ -36,8 +36,10 @@ _NEEDS = {
         ),
         "tests/episode_files.py",
         "torchrl_bmrl/experts/*",
+        "torchrl_bmrl/reports/films.py",
     ],
     "matplotlib": ["torchrl_bmrl/reports/*"],
+    "mujoco": ["torchrl_bmrl/reports/films.py"],
     "robosuite": ["torchrl_bmrl/envs/*", "torchrl_bmrl/experts/*"],
     "safetensors": ["torchrl_bmrl/checkpoint.py"],
     "scipy": ["torchrl_bmrl/evaluation/*", "torchrl_bmrl/reports/*"],

@@ -47,6 +47,7 @@ LOSS_SETTINGS = (
     "encoder_terms",
     "metric_weight",
     "metric_margin",
+    "isometry_weight",
     "classification_weight",
     "generator_weight",
     "direction_weight",
@@ -107,6 +108,7 @@ def train_student(config: Config, report: Report) -> None:
         teachers,
         qvalue_loc=normalisation[0],
         qvalue_scale=normalisation[1],
+        reward_scale=torch.stack([data["next", "reward"].std() for data in train]),
         **{name: getattr(settings, name) for name in LOSS_SETTINGS},
     ).to(config.device)
     optimizer = make_adam(loss.parameters(), lr=settings.lr)

@@ -19,11 +19,12 @@ import torch
 from omegaconf import DictConfig
 from settings import Config, run_recipe
 
-from torchrl_bmrl.agents import load_bcq_loss, load_student
+from torchrl_bmrl.agents import Student, load_bcq_loss, load_student
 from torchrl_bmrl.data.demonstrations import (
     demonstration_path,
     load_transitions,
     read_demonstrations,
+    read_phases,
     read_statistics,
 )
 from torchrl_bmrl.envs.transforms import make_env
@@ -31,9 +32,11 @@ from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome, evaluate_policy
 from torchrl_bmrl.experts.collect import collect_episode
 from torchrl_bmrl.modules import BCQPolicy
+from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.names import HORIZON, TASKS
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
 from torchrl_bmrl.reports import Embeddings, write_report
+from torchrl_bmrl.reports.films import explore_demonstrations
 from torchrl_bmrl.runs import read_versions
 
 
@@ -111,17 +114,24 @@ def expert_outcomes(config: Config, task: str, seeds: list[int]) -> list[Episode
     ]
 
 
-def embed_held_out(config: Config) -> tuple[Embeddings, float]:
-    """Embeddings of the held-out demonstrations and the classifier's accuracy on them."""
+def embed(config: Config, split: str) -> tuple[Embeddings, float]:
+    """Embeddings of a split of the demonstrations and the classifier's accuracy on them."""
     data_dir = Path(config.run_dir) / "data"
     statistics = read_statistics(data_dir)
-    student, _ = load_student(Path(config.run_dir) / "distill" / "checkpoint.safetensors")
-    held_out, distances = [], []
+    student, metadata = load_student(Path(config.run_dir) / "distill" / "checkpoint.safetensors")
+    with torch.random.fork_rng([]):
+        torch.manual_seed(derive_seed(config.seed, "untrained encoder"))
+        untrained = Student(**metadata["student"])
+    parts, distances, phases, phase_names = [], [], [], {}
     for index, task in enumerate(config.tasks):
-        held_out.append(load_transitions(data_dir, task, statistics, split="valid", num_task=index))
-        raw = read_demonstrations(demonstration_path(data_dir, task), split="valid", num_task=index)
+        path = demonstration_path(data_dir, task)
+        parts.append(load_transitions(data_dir, task, statistics, split=split, num_task=index))
+        raw = read_demonstrations(path, split=split, num_task=index)
         distances.append((raw["robot0_eef_pos"] - raw["goal_pos"]).norm(dim=-1).numpy())
-    data = torch.cat([part.select(*held_out[0].keys(True, True)) for part in held_out])
+        phase, names = read_phases(path, split=split)
+        phases.append(phase.numpy())
+        phase_names |= {task: names} if names else {}
+    data = torch.cat([part.select(*parts[0].keys(True, True)) for part in parts])
     # Class indices are positions in config.tasks; the report's are positions among all tasks.
     position = torch.tensor([TASKS.index(task) for task in config.tasks])
     embeddings = Embeddings(
@@ -130,6 +140,13 @@ def embed_held_out(config: Config) -> tuple[Embeddings, float]:
         episode=data["episode"].numpy(),
         step=data["step"].numpy(),
         distance=np.concatenate(distances),
+        success=data["next", "success"].squeeze(-1).numpy(),
+        phase=np.concatenate(phases),
+        phase_names=phase_names,
+        baselines={
+            "raw transition": torch.cat([data[key] for key in TRANSITION_KEYS], -1).numpy(),
+            "untrained encoder": untrained.embed(data).numpy(),
+        },
     )
     return embeddings, student.accuracy(data)
 
@@ -149,13 +166,15 @@ def evaluate(config: Config) -> None:
         unit="step",
     )
     write_results(run_dir / "results.csv", [row for part in rows for row in part])
-    embeddings, accuracy = embed_held_out(config)
+    embeddings, accuracy = embed(config, "valid")
     write_report(
         run_dir,
         default_source=config.evaluate.latent_sources[0],
         facts=run_facts(config),
         embeddings=embeddings,
+        training=embed(config, "train")[0],
         accuracy=accuracy,
+        explorer=explore_demonstrations(run_dir / "data", embeddings),
         seed=config.seed,
     )
     print((run_dir / "tables" / "results.md").read_text())

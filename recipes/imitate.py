@@ -43,11 +43,13 @@ from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.evaluation import bootstrap_interval
 from torchrl_bmrl.evaluation.rollout import evaluate_policy
 from torchrl_bmrl.experts.collect import collect_episode
-from torchrl_bmrl.files import write_atomic, write_rows
+from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.modules import DemonstrationTaskLatent, StageTaskLatent
 from torchrl_bmrl.modules.task_latent import ALIGNMENTS
 from torchrl_bmrl.names import composition_stages, horizon_of
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
+from torchrl_bmrl.reports.page import Section
+from torchrl_bmrl.reports.studies import write_study
 from torchrl_bmrl.reports.tables import Table, task_name
 from torchrl_bmrl.runs import open_run
 
@@ -259,8 +261,7 @@ def imitate(config: Config) -> None:
     rows = [row for part in results for row in part]
     write_rows(run_dir / "imitation" / "results.csv", rows)
     table = imitation_table(config, rows)
-    write_atomic(run_dir / "tables" / "imitation.csv", table.csv())
-    write_atomic(run_dir / "tables" / "imitation.md", table.markdown())
+    write_study(run_dir, "imitation", Section(heading="One-shot imitation", tables=[table]), {})
     print(table.markdown())
 
 

@@ -37,12 +37,12 @@ from torchrl_bmrl.agents import load_student
 from torchrl_bmrl.data.demonstrations import load_transitions, read_statistics
 from torchrl_bmrl.envs.transforms import StageReward, make_env
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
-from torchrl_bmrl.files import write_atomic, write_rows
+from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.modules import HeldTaskLatent, task_latent_box
 from torchrl_bmrl.modules.generator import Network, make_mlp
 from torchrl_bmrl.names import composition_stages, horizon_of
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
-from torchrl_bmrl.reports import Table, success_curves
+from torchrl_bmrl.reports import Picture, Section, Table, success_curves, write_study
 from torchrl_bmrl.runs import check_finite, open_run
 
 VARIANTS = ("latent", "raw")
@@ -258,6 +258,7 @@ def make_table(config: Config, agents: list[list[Row]]) -> Table:
 def latent_sac(config: Config) -> None:
     """Trains what is not done yet, then writes rows, table and figure."""
     settings, run_dir, folder = config.latent_sac, Path(config.run_dir), output_dir(config)
+    load_student(run_dir / "distill" / "checkpoint.safetensors")  # before anything is written
     # More seeds may join agents that are there; nothing else may differ.
     open_run(folder, {name: x for name, x in asdict(settings).items() if name != "seeds"})
     jobs = [(config, variant, seed) for seed in settings.seeds for variant in VARIANTS]
@@ -272,9 +273,6 @@ def latent_sac(config: Config) -> None:
     agents.sort(key=lambda rows: str(rows[0]["variant"]))
     write_rows(folder / "results.csv", [row for rows in agents for row in rows])
     table = make_table(config, agents)
-    name = f"latent_sac-{folder.name}"
-    write_atomic(run_dir / "tables" / f"{name}.md", table.markdown())
-    write_atomic(run_dir / "tables" / f"{name}.csv", table.csv())
     curves = {
         variant: [
             np.array([[float(row["environment_steps"]), float(row["success"])] for row in rows])
@@ -283,8 +281,14 @@ def latent_sac(config: Config) -> None:
         ]
         for variant in VARIANTS
     }
-    title = f"SAC on {settings.composition}, +1 for each stage and nothing else"
-    write_atomic(run_dir / "figures" / f"{name}.png", success_curves(curves, title=title))
+    name = f"latent_sac-{folder.name}"
+    picture = Picture(
+        png=success_curves(curves, title=table.title),
+        alt="success over the environment's steps, with m and with raw actions",
+        caption="Thin: a seed. Thick: their mean. Dashed: half of the episodes.",
+    )
+    section = Section(heading="Learning on top", tables=[table])
+    write_study(run_dir, name, section, {name: picture})
     print(table.markdown())
 
 

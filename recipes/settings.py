@@ -86,6 +86,7 @@ class DistillSettings:
     latent_norm_weight: float = 2e-3
     metric_weight: float = 0.0  # of the triplet loss on m
     metric_margin: float = 1.0
+    isometry_weight: float = 1.0  # of distances in m that are those of rewards and actions
     normalise_qvalue: bool = True
     prototype: str = "mean"  # or medoid
 
@@ -123,6 +124,14 @@ class ImitateSettings:
 
 
 @dataclass
+class InterpolationSettings:
+    """Exploration between the tasks' embeddings (interpolate.py)."""
+
+    task: str = "lift"  # whose scene, and whose prototype the paths start from
+    episodes: int = 50  # of each method
+
+
+@dataclass
 class LatentSACSettings:
     """SAC on top of the distilled policy, beside SAC alone (latent_sac.py)."""
 
@@ -157,6 +166,7 @@ class Config:
     evaluate: EvaluateSettings = field(default_factory=EvaluateSettings)
     human: HumanSettings = field(default_factory=HumanSettings)
     imitate: ImitateSettings = field(default_factory=ImitateSettings)
+    interpolation: InterpolationSettings = field(default_factory=InterpolationSettings)
     latent_sac: LatentSACSettings = field(default_factory=LatentSACSettings)
 
 
@@ -184,6 +194,7 @@ POSITIVE = (
     "imitate.demonstrations",
     "imitate.episodes",
     "imitate.cloning_updates",
+    "interpolation.episodes",
     "latent_sac.hold",
     "latent_sac.num_candidates",
     "latent_sac.environment_steps",
@@ -207,7 +218,7 @@ def check_settings(config: Config) -> None:
     Raises:
         BMRLError: naming the key, its value and what is valid.
     """
-    for task in [*config.tasks, *config.collect.train_episodes]:
+    for task in [*config.tasks, *config.collect.train_episodes, config.interpolation.task]:
         check_task(task)
     missing = [task for task in config.tasks if task not in config.collect.train_episodes]
     if not config.tasks or missing or len(set(config.tasks)) < len(config.tasks):
@@ -234,7 +245,12 @@ def check_settings(config: Config) -> None:
     for key in ("bcq.lmbda", "bcq.gamma", "distill.context_fraction"):
         if not 0 <= (value := OmegaConf.select(settings, key)) <= 1:
             raise ConfigError(f"{key} is {value}; valid: between 0 and 1")
-    for key in ("bcq.generator_warmup", "collect.noise", "distill.metric_weight"):
+    for key in (
+        "bcq.generator_warmup",
+        "collect.noise",
+        "distill.metric_weight",
+        "distill.isometry_weight",
+    ):
         if (value := OmegaConf.select(settings, key)) < 0:
             raise ConfigError(f"{key} is {value}; valid: 0 or above")
     for key in ("bcq.critic_grad_clip", "bcq.latent_clip"):

@@ -237,6 +237,40 @@ def test_metric_term_needs_two_tasks() -> None:
 # -- gradients ---------------------------------------------------------------------------------
 
 
+def test_isometry_error_compares_distances_within_a_task_alone() -> None:
+    teachers = make_teachers(TASKS)
+    loss = make_distillation_loss(
+        teachers=teachers,
+        isometry_weight=0.5,
+        reward_scale=torch.arange(1.0, 5.0)[: batch().shape[0]],
+        reduction="none",
+    )
+    data = batch()
+    found = run(loss, data)["loss_isometry"]
+    m = loss._encode(data.select(*loss.task_encoder.in_keys)).detach()
+    for task, generator in enumerate(teachers[0]):
+        asked = data[task].select("observation")
+        asked["action_latent"] = torch.zeros(*asked.batch_size, LATENT_DIM, dtype=m.dtype)
+        content = torch.cat(
+            [data["next", "reward"][task] / (task + 1), generator(asked)["action"]], -1
+        )
+        errors = [
+            [((a - b).norm() - (c - d).norm()) ** 2 for b, d in zip(m[task], content, strict=True)]
+            for a, c in zip(m[task], content, strict=True)
+        ]
+        expected = 0.5 * torch.tensor(errors).mean(-1)
+        torch.testing.assert_close(found[task], expected.to(found), atol=1e-5, rtol=1e-4)
+
+
+def test_isometry_is_off_by_default_and_trains_the_encoder_alone() -> None:
+    assert "loss_isometry" not in run(make_distillation_loss(), batch())
+    loss = make_distillation_loss(isometry_weight=0.5)
+    run(loss, batch())["loss_isometry"].backward()
+    assert reached(loss) == {"task_encoder"}
+    with pytest.raises(BMRLError, match="isometry_weight"):
+        make_distillation_loss(isometry_weight=-1.0)
+
+
 @pytest.mark.parametrize(
     "terms",
     [(), *((term,) for term in ENCODER_TERMS), ("generator", "qvalue"), ENCODER_TERMS],

@@ -36,6 +36,7 @@ from torchrl_bmrl.modules import (
     DemonstrationTaskLatent,
     DiscreteBCQPolicy,
     OnlineTaskLatent,
+    PathTaskLatent,
     PLASPolicy,
     PrototypeTaskLatent,
     StageTaskLatent,
@@ -618,6 +619,48 @@ def test_an_unknown_alignment_is_refused_with_the_valid_ones(encoder: TensorDict
 def test_a_demonstration_is_no_transform_of_stored_data(encoder: TensorDictModule) -> None:
     with pytest.raises(BMRLError, match="environment"):
         DemonstrationTaskLatent(demonstration(), encoder)(demonstration())
+
+
+PATHS = torch.arange(24.0).reshape(2, 4, 3)[..., :TASK_LATENT_DIM]
+"""A path of four points for each of two environments."""
+
+
+@pytest.mark.parametrize(
+    ("batch_size", "points"),
+    [((), PATHS[0]), ((2,), PATHS[0]), ((2,), PATHS), ((2,), PATHS[:, :1])],
+)
+def test_a_path_goes_point_by_point_in_every_environment_and_holds_its_last(
+    batch_size: tuple[int, ...], points: Tensor
+) -> None:
+    env = TransformedEnv(Walk(batch_size), PathTaskLatent(points))
+    check_env_specs(env, seed=0)
+    for steps in (10, 2, 10):  # an episode that is broken off restarts as well
+        latent = env.rollout(steps)["task_latent"]
+        held = torch.arange(min(steps, 6)).clamp(max=points.shape[-2] - 1)
+        expected = points[..., held, :].expand(*batch_size, -1, -1)
+        assert torch.equal(latent, expected)
+
+
+def test_of_several_paths_only_those_whose_episode_restarts_start_again() -> None:
+    env = TransformedEnv(Walk((2,)), PathTaskLatent(PATHS))
+    data = env.reset()
+    for _ in range(2):
+        data = env.step(env.rand_action(data))["next"].exclude("reward")
+    data = env.reset(data.set("_reset", torch.tensor([[True], [False]])))
+    assert torch.equal(data["task_latent"], torch.stack([PATHS[0, 0], PATHS[1, 2]]))
+    latent = env.step(env.rand_action(data))["next", "task_latent"]
+    assert torch.equal(latent, torch.stack([PATHS[0, 1], PATHS[1, 3]]))
+
+
+def test_a_path_without_points_or_for_other_environments_is_refused() -> None:
+    for points in (torch.zeros(2), torch.zeros(0, 2)):
+        with pytest.raises(BMRLError, match=r"valid: \(\*B, T, m\), T > 0"):
+            PathTaskLatent(points)
+    for batch_size in ((), (3,)):
+        with pytest.raises(BMRLError, match=r"paths of batch \(2,\) in an environment of"):
+            TransformedEnv(Walk(batch_size), PathTaskLatent(PATHS)).reset()
+    with pytest.raises(BMRLError, match="PathTaskLatent acts in an environment"):
+        PathTaskLatent(PATHS)(demonstration())
 
 
 def test_student_acts_in_an_environment_with_a_task_latent(encoder: TensorDictModule) -> None:

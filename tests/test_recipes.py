@@ -87,7 +87,7 @@ def configured(*overrides: str) -> DictConfig:
         (["preset=smoke", "bcq.lrr=1"], ["bcq.lrr", "BCQSettings"]),
         (["preset=smoke", "bcq.lr=abc"], ["bcq.lr", "'abc'", "Float"]),
         (["preset=smoke", "tasks=[lfit]"], ["error: unknown task 'lfit'", "reach, lift, push_r"]),
-        (["preset=fast"], ["preset/fast", "literal", "paper", "quick", "smoke"]),
+        (["preset=fast"], ["preset/fast", "compose", "literal", "paper", "quick", "smoke"]),
         (["preset=smoke", "logger=log"], ["unknown logger 'log'", "csv, wandb, tensorboard, none"]),
         (["preset=smoke", "distill.updates=-5"], ["error: distill.updates is -5", "above 0"]),
     ],
@@ -136,6 +136,7 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
         ("bcq.value_bounds=[1,0]", r"value_bounds are .1.0, 0.0.; valid: .*low < high"),
         ("distill.encoder_terms=[critic]", "unknown encoder term 'critic'; .*qvalue, metric"),
         ("distill.metric_weight=-1", "distill.metric_weight is -1.0; valid: 0 or above"),
+        ("distill.isometry_weight=-1", "distill.isometry_weight is -1.0; valid: 0 or above"),
         ("workers=0", "workers is 0"),
         ("bcq.lr=0", "bcq.lr is 0"),
         ("bcq.seeds=0", "bcq.seeds is 0"),
@@ -143,6 +144,8 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
         ("device=gpu", "device is 'gpu'; valid: one that torch can use"),
         ("bcq.eval_episodes=0", "bcq.eval_episodes is 0"),
         ("evaluate.episodes=-1", "evaluate.episodes is -1"),
+        ("interpolation.episodes=0", "interpolation.episodes is 0"),
+        ("interpolation.task=lfit", "unknown task 'lfit'"),
         ("checkpoint_interval=0", "checkpoint_interval is 0"),
         ("latent_sac.composition=reach-lfit", "unknown task 'lfit'"),
         ("latent_sac.hold=0", "latent_sac.hold is 0"),
@@ -158,7 +161,7 @@ def test_every_stage_is_checked_before_the_first_one_starts(
         recipes.check_settings(config)
 
 
-@pytest.mark.parametrize("preset", ["smoke", "quick", "paper", "literal"])
+@pytest.mark.parametrize("preset", ["smoke", "quick", "paper", "literal", "compose"])
 def test_every_preset_is_complete_and_valid(recipes: Any, tmp_path: Path, preset: str) -> None:
     config = OmegaConf.to_object(configured(f"preset={preset}", f"run_dir={tmp_path}"))
     recipes.check_settings(config)
@@ -258,12 +261,13 @@ def test_two_stages_from_an_empty_folder_to_the_report_and_again(tmp_path: Path)
     assert sum(counts.values()) == len(rows)
     assert all(0 < row.episode_return < 600 for row in rows)
 
-    for name in ("results", "table1", "table2"):
+    for name in ("results", "table1", "table2", "stages", "goal_distance"):
         assert "lift" in (folder / "tables" / f"{name}.csv").read_text().lower()
         assert "\n| Lift |" in (folder / "tables" / f"{name}.md").read_text()
     page = (folder / "report.html").read_text()
     assert page.rstrip().endswith("</html>")
     assert page.count("data:image/png;base64") >= 2
+    assert "Explore the embedding" in page
     assert yaml.safe_load((folder / "config.yaml").read_text())["bcq"]["num_cells"] == [16, 16]
     versions = json.loads((folder / "versions.json").read_text())
     assert {"torch", "torchrl", "robosuite", "mujoco", "python", "torchrl_bmrl"} <= set(versions)
@@ -771,6 +775,190 @@ def test_learning_from_people_compares_every_share_and_goes_on(
         learn_from_people.train_job((config, share, 0), lambda _: None)
     scripted, human = (buffer.sample()["index"] for buffer in buffers)
     assert scripted.max() < HORIZON <= human.min()
+
+
+# -- one-shot imitation ----------------------------------------------------------------------------
+
+IMITATE = ["imitate.composition=reach-lift", "imitate.demonstrations=2", "imitate.episodes=4"]
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_imitation_compares_every_method_and_perturbation_and_goes_on(
+    run: Run, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import imitate
+
+    monkeypatch.setattr(imitate, "PERTURBATIONS", ("none", "both, constant"))
+    folder = Path(shutil.copytree(finished, tmp_path / "run"))
+    run(folder, imitate.imitate, *IMITATE)
+    with (folder / "imitation" / "results.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    cells = {(row["method"], row["perturbation"], row["demonstration"]) for row in rows}
+    assert len(cells) == len(imitate.METHODS) * 2 * 2
+    assert len(rows) == 2 * len(cells)
+    assert {row["stages"] for row in rows} <= {"0", "1", "2"}
+    assert all((row["stages"] == "2") == (row["success"] == "1") for row in rows)
+    table = (folder / "tables" / "imitation.csv").read_text().splitlines()
+    assert table[0] == "Method,Perturbation,1. Reach,2. Lift,Whole,95% interval,Episodes"
+    assert len(table) == 1 + len(imitate.METHODS) * 2
+
+    written = contents(folder, "imitation/*", "tables/imitation.*")
+    (folder / "imitation" / "replay-none-1.csv").unlink()  # as a kill would leave it
+    run(folder, imitate.imitate, *IMITATE)
+    assert contents(folder, "imitation/*", "tables/imitation.*") == written
+
+    # A study is held to its own settings; the run's others stay free.
+    with pytest.raises(SystemExit):
+        run(folder, imitate.imitate, *IMITATE, "imitate.max_angle=10")
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_what_drives_imitation_is_one_demonstration_from_another_start(
+    run: Run, finished: Path, tmp_path: Path
+) -> None:
+    import imitate
+
+    from torchrl_bmrl.data.demonstrations import read_statistics
+
+    settings = configured(*SMALL, *IMITATE, f"run_dir={tmp_path}", "workers=1")
+    config = OmegaConf.to_object(settings)
+    paths = [imitate.demonstrate(config, number) for number in (0, 1)]
+    statistics = read_statistics(finished / "data")
+    first, second = (imitate.read_demonstration(path, statistics) for path in paths)
+    assert first["stage"].unique().tolist() == second["stage"].unique().tolist() == [0, 1, 2]
+    assert not torch.equal(first["observation"][0], second["observation"][0])
+    # Open loop: the actions of the demonstration, whatever happens.
+    policy, (counter,) = imitate.make_method(config, "replay", paths[0], statistics)
+    from torchrl_bmrl.envs.transforms import make_env
+
+    played = make_env("reach-lift", statistics, counter).rollout(20, policy)
+    assert torch.equal(played["action"], first["action"][:20])
+    # Cloning fits that demonstration.
+    clone, _ = imitate.make_method(config, "cloning", paths[0], statistics)
+    error = (clone(first.select("observation"))["action"] - first["action"]).square().mean()
+    assert error < 0.5 * first["action"].var(0).mean()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (["imitate.composition=reach-push_up"], "imitate.composition is reach-push_up, but the"),
+        (["imitate.composition=reach-lfit"], "unknown task 'lfit'"),
+        (["imitate.episodes=7", "imitate.demonstrations=2"], "a multiple of"),
+        ([], "checkpoint.safetensors"),
+    ],
+    ids=["task the policy lacks", "no task", "uneven episodes", "no student"],
+)
+def test_imitation_names_what_is_wrong_and_writes_no_study(
+    recipes: Any, tmp_path: Path, overrides: list[str], says: str, capsys: Any
+) -> None:
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    import imitate
+
+    settings = configured(*SMALL, *overrides, f"run_dir={tmp_path}", "workers=1")
+    with pytest.raises(SystemExit):
+        recipes.run_recipe(settings, imitate.imitate)
+    assert says in capsys.readouterr().err
+    assert not (tmp_path / "imitation").exists()
+
+
+# -- interpolation ---------------------------------------------------------------------------------
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_interpolation_plays_every_method_beside_what_it_is_compared_with(
+    run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("sklearn")
+    import collect
+    import distill
+    import interpolate
+    import train_bcq
+
+    from torchrl_bmrl.evaluation import rollout
+
+    monkeypatch.setitem(rollout.rollout_episodes.__kwdefaults__, "max_steps", HORIZON)
+    options = ["collect.valid_episodes=2", "distill.task_latent_dim=3", "interpolation.episodes=4"]
+    for stage in (collect.collect, train_bcq.train_all, distill.distill, interpolate.interpolate):
+        run(tmp_path, stage, *options)
+
+    folder = tmp_path / "interpolation" / "lift-4"
+    rows = {path.stem: list(csv.DictReader(path.open())) for path in folder.glob("*.csv")}
+    noises = {f"{name}_noise" for name in interpolate.WITH_NOISE}
+    assert set(rows) == {*interpolate.METHODS, *noises, *interpolate.SWITCHES}
+    assert {len(part) for part in rows.values()} == {4 * HORIZON}
+
+    def column(name: str, field: str) -> list[float]:
+        return [float(row[field]) for row in rows[name]]
+
+    # Lift starts 10 cm above the cube, whatever the method, from the same places.
+    for name in set(rows) - set(interpolate.SWITCHES):
+        starts = [row for row in rows[name] if row["step"] == "0"]
+        for row, expected in zip(starts, rows["prototype"][::HORIZON], strict=True):
+            assert float(row["eef_z"]) - float(row["goal_z"]) == pytest.approx(0.1, abs=1e-3)
+            assert float(row["eef_x"]) == pytest.approx(float(row["goal_x"]), abs=1e-3)
+            assert row["goal_x"] == expected["goal_x"]
+    # The same m and the same proposals are the same action; another m is another.
+    assert set(column("prototype", "deviation")) == {0.0}
+    assert sum(column("straight", "deviation")) > 0
+    size, noise = (sum(column(name, "deviation")) for name in ("straight", "straight_noise"))
+    assert noise == pytest.approx(size, rel=0.3)
+    assert column("straight", "along")[::HORIZON] == [0.25, 0.5, 0.75, 1.0]
+    step = pytest.approx(1 / (HORIZON - 1), abs=1e-4)
+    assert column("curve_moving", "along")[:2] == [0.0, step]
+
+    for name, lines in (("interpolation", len(interpolate.METHODS) + 2), ("switching", 3)):
+        table = (tmp_path / "tables" / f"{name}.csv").read_text().splitlines()
+        assert len(table) == 1 + lines
+        page = (tmp_path / "tables" / f"{name}.md").read_text()
+        assert f"\n| {table[1].split(',')[0]} | 4 |" in page
+    for name in ("trajectories", "paths"):
+        picture = tmp_path / "figures" / f"interpolation_{name}.png"
+        assert picture.read_bytes()[1:4] == b"PNG"
+
+    before = contents(tmp_path, "interpolation/**/*", "tables/*", "figures/*")
+    written = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+    (folder / "straight_noise.csv").unlink()
+    run(tmp_path, interpolate.interpolate, *options)
+    assert contents(tmp_path, "interpolation/**/*", "tables/*", "figures/*") == before
+    again = {path.stem for path in folder.iterdir() if path.stat().st_mtime_ns != written[path]}
+    assert again == {"straight", "straight_noise"}
+    for option, says in (
+        ("interpolation.task=push_up", "interpolation.task is push_up; valid: one of tasks"),
+        ("interpolation.episodes=1", "interpolation.episodes is 1; valid: at least one for each"),
+    ):
+        with pytest.raises(SystemExit):
+            run(tmp_path, interpolate.interpolate, *options, option)
+        assert says in capsys.readouterr().err
+
+
+def test_an_outcome_counts_as_neither_when_no_end_of_the_path_has_it(recipes: Any) -> None:
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    pytest.importorskip("matplotlib")
+    import interpolate
+
+    config = OmegaConf.to_object(configured("preset=smoke", "run_dir=run"))
+    ends = {"lift": (0, 0, 0.1), "push_up": (0.1, 0, 0), "reach": (0, 0, 0)}
+
+    def episodes(*labelled: tuple[str, tuple[float, ...]]) -> dict[str, Any]:
+        cube = torch.zeros(len(labelled), 2, 3).numpy()
+        for i, (_, end) in enumerate(labelled):
+            cube[i, -1] = end
+        return {"cube": cube, "label": [label for label, _ in labelled]}
+
+    # One push that failed does not make "still" usual.
+    tasks = episodes(*ends.items(), *ends.items(), ("push_up", (0, 0, 0)))
+    lift, up, still = ends.values()
+    between = [("push_up", lift), ("push_up", up), ("push_up", still), ("reach", up)]
+    share = interpolate.share_of_neither(config, episodes(*between), tasks)
+    assert share == "50%"
 
 
 # -- learning on top -------------------------------------------------------------------------------

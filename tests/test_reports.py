@@ -19,6 +19,7 @@ for extra in ("scipy", "matplotlib", "jinja2", "sklearn"):
 
 from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.evaluation import ResultRow, summarise, write_results
+from torchrl_bmrl.evaluation.embedding import STAGE_TAIL
 from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports import (
     TASK_COLORS,
@@ -26,19 +27,28 @@ from torchrl_bmrl.reports import (
     Section,
     Table,
     embedding_scatter,
+    embedding_stages,
     embedding_tsne,
+    goal_distance_table,
+    measure_goal_distance,
+    measure_stages,
     paper,
     reach_trajectories,
     read_stage1_curves,
     results_table,
     stage1_curves,
+    stages_table,
     table_1,
     table_2,
     write_page,
     write_report,
 )
+from torchrl_bmrl.reports.figures import behaviour_trajectories, embedding_paths
 
 ARMS = [("expert", ""), ("bcq", ""), ("distilled", "prototype"), ("distilled", "online")]
+
+
+TABLES = ("results", "table1", "table2", "stages", "goal_distance")
 
 
 def make_rows(tasks: tuple[str, ...] = TASKS) -> list[ResultRow]:
@@ -68,8 +78,29 @@ def make_embeddings(dim: int = 2) -> Embeddings:
     task, episode, step = task[shuffle], episode[shuffle], step[shuffle]
     latent = rng.normal(size=(task.size, dim)) + 5.0 * task[:, None]
     return Embeddings(
-        task_latent=latent, task=task, episode=episode, step=step, distance=0.3 / (1 + step)
+        task_latent=latent,
+        task=task,
+        episode=episode,
+        step=step,
+        distance=0.3 / (1 + step),
+        success=step >= 6,
+        phase=np.where(task == 0, 0, step // 3),
+        phase_names={
+            t: ("reach",) if t == "reach" else ("descend", "grasp", "lift") for t in TASKS
+        },
+        baselines={"raw transition": rng.normal(size=(task.size, 5))},
     )
+
+
+def make_known(dim: int = 2, seed: int = 0) -> Embeddings:
+    """Embeddings whose stages lie apart, and whose distance to the goal is that to the origin."""
+    data = make_embeddings(dim)
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=(3, dim))[data.phase]
+    direction += 0.05 * rng.normal(size=direction.shape)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    way = np.where(data.step < 6, data.distance, 0.0)
+    return replace(data, task_latent=40.0 * way[:, None] * direction)
 
 
 def mean(rows: list[ResultRow], task: str, policy: str, source: str = "") -> float:
@@ -215,7 +246,13 @@ def test_figures_repeat_exactly_and_change_with_the_data() -> None:
         lambda m: embedding_scatter(m, data.task),
         lambda m: embedding_tsne(m, data.task, seed=0),
         lambda m: reach_trajectories(m, data.episode, data.distance),
+        lambda m: reach_trajectories(m, data.episode, data.distance, success_point=m[0]),
+        lambda m: embedding_stages(m, data.phase, data.step // 3, ("a", "b", "c")),
         lambda m: stage1_curves({"lift": curve}, expert_means={"lift": float(m.sum())}),
+        lambda m: embedding_paths(m, data.task, {"straight": [m[:5]], "curve": [m[3:7]]}, m[:2]),
+        lambda m: behaviour_trajectories(
+            {"line": np.tile(m, (1, 1, 2))[..., :3]}, {"line": m[:1, :1]}
+        ),
     ]
     for draw in draws:
         image = draw(data.task_latent)
@@ -243,6 +280,11 @@ def test_embeddings_of_other_sizes_are_drawn(dim: int) -> None:
         embedding_scatter(data.task_latent, data.task),
         embedding_tsne(data.task_latent[:40], data.task[:40]),
         reach_trajectories(data.task_latent, data.episode, data.distance),
+        reach_trajectories(
+            data.task_latent, data.episode, data.distance, success_point=data.task_latent[0]
+        ),
+        embedding_stages(data.task_latent[:40], data.phase[:40], data.phase[:40], ("a", "b", "c")),
+        embedding_paths(data.task_latent, data.task, {"curve": [data.task_latent]}, np.eye(1, dim)),
     ):
         assert image.startswith(b"\x89PNG")
 
@@ -256,6 +298,8 @@ def test_figures_refuse_what_they_cannot_draw() -> None:
         embedding_tsne(np.zeros((3, 2)), np.zeros(3, dtype=int))
     with pytest.raises(BMRLError, match="no trajectory"):
         reach_trajectories(np.zeros((0, 2)), np.zeros(0, dtype=int), np.zeros(0))
+    with pytest.raises(BMRLError, match="no trajectory"):
+        behaviour_trajectories({}, {})
 
 
 def test_embeddings_refuse_what_does_not_fit() -> None:
@@ -272,9 +316,88 @@ def test_embeddings_refuse_what_does_not_fit() -> None:
         ("task_latent", np.full((3, 2), np.nan)),
         ("step", np.zeros(4, dtype=int)),
         ("distance", np.full(3, np.inf)),
+        ("success", np.zeros((3, 1), dtype=bool)),
+        ("baselines", {"raw": np.zeros((2, 5))}),
+        ("phase_names", {"reach": ()}),
     ):
-        with pytest.raises(BMRLError, match=name):
+        message = {"baselines": "raw", "phase_names": r"phase holds \[0\] for reach"}
+        with pytest.raises(BMRLError, match=message.get(name, name)):
             Embeddings(**{**fits, name: value})
+
+
+# What the embedding knows
+
+
+@pytest.mark.parametrize("dim", [2, 5])
+def test_stages_and_distances_that_are_there_are_found(dim: int) -> None:
+    training, held_out = make_known(dim), make_known(dim, seed=0)
+    stages = measure_stages(training, held_out)
+    assert [r.task for r in stages] == [t for t in TASKS if t != "reach"]
+    for result in stages:
+        # Three episodes of eight steps, all within the tail after success at step 6.
+        assert (result.episodes, result.transitions) == (3, 24)
+        assert result.agreement["embedding"].value > result.agreement["raw transition"].value
+    distances = measure_goal_distance(training, held_out)
+    assert [r.task for r in distances] == list(TASKS)
+    for result in distances:
+        assert result.correlation["embedding"].value > 0.95
+        assert abs(result.correlation["raw transition"].value) < 0.9
+        assert result.lowest <= result.correlation["embedding"].value
+        assert result.spread is not None
+        assert result.spread.value == 0.0
+
+
+def test_what_happens_after_success_changes_no_number() -> None:
+    data = make_known()
+    after = data.step > 6
+    noise = np.random.default_rng(0).normal(size=data.task_latent.shape)
+    moved = replace(
+        data,
+        task_latent=np.where(after[:, None], noise, data.task_latent),
+        phase=np.where(after, 0, data.phase),
+        distance=np.where(after, 9.0, data.distance),
+    )
+    assert measure_goal_distance(moved, moved) == measure_goal_distance(data, data)
+    sooner = replace(data, success=data.step >= 3)
+    assert measure_goal_distance(data, sooner) != measure_goal_distance(data, data)
+    # Stages look further, by STAGE_TAIL steps.
+    late = [replace(x, step=np.where(after, x.step + STAGE_TAIL, x.step)) for x in (data, moved)]
+    assert measure_stages(late[0], late[0]) == measure_stages(late[1], late[1])
+    assert measure_stages(data, data) != measure_stages(moved, moved)
+
+
+def test_groups_are_found_in_training_data_alone() -> None:
+    data = make_known()
+    only_one = data.rows(data.episode == 0)
+    alone = {r.task: r for r in measure_stages(data, only_one)}
+    # Were they found in what they are measured on, the other training data would not matter.
+    other = replace(data, task_latent=np.random.default_rng(1).normal(size=data.task_latent.shape))
+    assert any(r.agreement != alone[r.task].agreement for r in measure_stages(other, only_one))
+
+
+def test_the_tables_hold_what_was_measured() -> None:
+    data = make_known()
+    stages, distances = measure_stages(data, data), measure_goal_distance(data, data)
+    for result, line in zip(stages, cells(stages_table(stages)), strict=True):
+        assert line["Phases"] == "descend, grasp, lift"
+        assert line["Embedding"] == str(result.agreement["embedding"])
+        assert line["Raw transition"] == str(result.agreement["raw transition"])
+        assert (line["Episodes"], line["Transitions"]) == ("3", "24")
+    for result, line in zip(distances, cells(goal_distance_table(distances)), strict=True):
+        assert line["Embedding"] == str(result.correlation["embedding"])
+        assert line["Lowest episode"] == f"{result.lowest:.2f}"
+        assert line["Spread, success over start"] == str(result.spread)
+
+
+def test_the_report_says_what_it_could_not_measure(tmp_path: Path) -> None:
+    write_results(tmp_path / "results.csv", make_rows())
+    data = replace(make_known(), phase_names={}, success=np.zeros(144, dtype=bool))
+    page = write_report(
+        tmp_path, default_source="online", facts={}, embeddings=data, training=data
+    ).read_text(encoding="utf-8")
+    assert "stages are left out: no phases" in page
+    assert "distances are left out: no training demonstration succeeds" in page
+    assert {p.stem for p in (tmp_path / "tables").iterdir()} == {"results", "table1", "table2"}
 
 
 # Page and report
@@ -301,20 +424,27 @@ def test_a_whole_report_is_written_and_stands_alone(tmp_path: Path) -> None:
         default_source="prototype",
         facts={"seed": "0"},
         embeddings=make_embeddings(),
+        training=make_embeddings(),
         accuracy=0.987,
     )
     files = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
     assert files - {"results.csv"} - {f"bcq/{task}/evaluations.csv" for task in TASKS} == {
         "report.html",
-        *(f"tables/{n}.{e}" for n in ("results", "table1", "table2") for e in ("md", "csv")),
+        *(f"tables/{n}.{e}" for n in TABLES for e in ("md", "csv")),
         *(
             f"figures/{n}.png"
-            for n in ("stage1_curves", "embedding", "embedding_tsne", "reach_trajectories")
+            for n in (
+                "stage1_curves",
+                "embedding",
+                "embedding_tsne",
+                "embedding_stages",
+                "reach_trajectories",
+            )
         ),
     }
     text = page.read_text(encoding="utf-8")
     resources = Resources(text)
-    assert len(resources.links) == resources.tags.count("img") == 4
+    assert len(resources.links) == resources.tags.count("img") == 5
     assert all(link.startswith("data:image/png;base64,") for link in resources.links)
     assert not re.search(r"https?:|url\(|@import", text)
     assert {"script", "link", "iframe"}.isdisjoint(resources.tags)
@@ -365,16 +495,11 @@ def test_the_report_does_not_depend_on_the_order_of_transitions(tmp_path: Path) 
     write_results(tmp_path / "results.csv", make_rows())
     data = make_embeddings()
     order = np.random.default_rng(5).permutation(len(data.task))
-    shuffled = Embeddings(
-        task_latent=data.task_latent[order],
-        task=data.task[order],
-        episode=data.episode[order],
-        step=data.step[order],
-        distance=data.distance[order],
-    )
     pages = [
-        write_report(tmp_path, default_source="online", facts={}, embeddings=e).read_bytes()
-        for e in (data, shuffled)
+        write_report(
+            tmp_path, default_source="online", facts={}, embeddings=e, training=e
+        ).read_bytes()
+        for e in (data, data.rows(order))
     ]
     assert pages[0] == pages[1]
 

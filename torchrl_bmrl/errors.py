@@ -98,6 +98,25 @@ class CheckpointError(BMRLError):
         return f"{self.path}: {self.message}"
 
 
+class RenderError(BMRLError):
+    """Pictures that cannot be made here: no graphics library works.
+
+    Args:
+        problems: what each library that was tried said.
+
+    Example:
+        >>> print(RenderError(["egl: no such library"]))
+        no pictures can be rendered here (egl: no such library)
+    """
+
+    def __init__(self, problems: Iterable[str]) -> None:
+        self.problems = tuple(problems)
+        super().__init__(self.problems)
+
+    def __str__(self) -> str:
+        return f"no pictures can be rendered here ({'; '.join(self.problems)})"
+
+
 def _plural(noun: str) -> str:
     """Regular English plural of a noun.
 

@@ -200,6 +200,34 @@ def triplet_error(anchor: Tensor, positive: Tensor, negative: Tensor, margin: fl
     return (near - far + margin).clamp(min=0.0)
 
 
+def isometry_error(task_latent: Tensor, content: Tensor) -> Tensor:
+    r"""How far distances in an embedding are from those of what it embeds.
+
+    .. math:: \frac{1}{n} \sum_j \left(\lVert m_i - m_j \rVert - \lVert c_i - c_j \rVert\right)^2
+
+    The stress of multi-dimensional scaling (Kruskal, *Multidimensional scaling by optimizing
+    goodness of fit to a nonmetric hypothesis*, Psychometrika 1964), without its normalisation.
+
+    Args:
+        task_latent: m, ``(*B, n, d)``.
+        content: c, ``(*B, n, k)``.
+
+    Returns:
+        ``(*B, n)``; finite gradients also where two points meet.
+
+    Example:
+        >>> content = torch.tensor([[0.0], [3.0]])
+        >>> isometry_error(torch.tensor([[1.0, 1.0], [1.0, 4.0]]), content)
+        tensor([0., 0.])
+    """
+
+    def distances(points: Tensor) -> Tensor:
+        difference = points.unsqueeze(-2) - points.unsqueeze(-3)
+        return (difference.square().sum(-1) + 1e-12).sqrt()
+
+    return (distances(task_latent) - distances(content)).square().mean(-1)
+
+
 def direction_error(prediction: Tensor, target: Tensor) -> Tensor:
     r"""One minus the cosine of the angle between prediction and target.
 

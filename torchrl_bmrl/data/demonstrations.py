@@ -6,10 +6,13 @@ import json
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from torchrl_bmrl.data.datasets import RobomimicExperienceReplay
+from torchrl_bmrl.data.robomimic import open_episodes
 from torchrl_bmrl.data.schema import ACTION_DIM, OBSERVATION_SHAPES
 from torchrl_bmrl.envs.transforms import ObservationStatistics, transform_data
 from torchrl_bmrl.errors import DataError
@@ -49,6 +52,44 @@ def read_demonstrations(path: Path, *, split: str | None = None, num_task: int) 
     if data["next", "terminated"].any():
         raise DataError(path, "terminated", "an episode terminates; valid: none, horizons truncate")
     return data.set("task", torch.full((len(data),), num_task))
+
+
+def read_phases(path: Path, *, split: str) -> tuple[Tensor, tuple[str, ...]]:
+    """The expert's phase at each step of the demonstrations.
+
+    Args:
+        path: a file in robomimic's layout.
+        split: ``"train"`` or ``"valid"``.
+
+    Returns:
+        indices ``(N,)``, in the order of :func:`read_demonstrations`, and the phases' names. Files
+        of other demonstrators have no phases: zeros ``(N,)`` and no names.
+
+    Raises:
+        DataError: naming file and key, if some demonstrations have phases and others do not, they
+            differ in the names, or an index has no name.
+    """
+    parts, names = [], None
+    with open_episodes(path, split=split, observation_keys=[], extras=["phases"]) as episodes:
+        for demo, episode in episodes.items():
+            phases = np.asarray(episode.extras.get("phases", np.zeros(len(episode))))
+            found = tuple(map(str, episode.attributes.get("phase_names", ())))
+            found = found if "phases" in episode.extras else ()
+            names = found if names is None else names
+            if found != names:
+                raise DataError(
+                    path, f"data/{demo}", f"phases are {found}; valid: {names}, as before"
+                )
+            if names and not np.isin(phases, np.arange(len(names))).all():
+                raise DataError(
+                    path,
+                    f"data/{demo}/phases",
+                    f"holds {np.unique(phases).tolist()}; valid: 0 to {len(names) - 1}, the "
+                    "positions in phase_names",
+                )
+            parts.append(torch.as_tensor(phases).long())
+    joined = torch.cat(parts)
+    return (joined, names) if names else (torch.zeros_like(joined), ())
 
 
 def write_statistics(data_dir: Path, tasks: Iterable[str]) -> ObservationStatistics:

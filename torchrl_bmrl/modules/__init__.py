@@ -18,6 +18,7 @@ from torchrl_bmrl.modules.policy import (
 from torchrl_bmrl.modules.task_latent import (
     DemonstrationTaskLatent,
     OnlineTaskLatent,
+    PathTaskLatent,
     PrototypeTaskLatent,
     StageTaskLatent,
     make_task_classifier,
@@ -33,6 +34,7 @@ __all__ = [
     "HeldTaskLatent",
     "OnlineTaskLatent",
     "PLASPolicy",
+    "PathTaskLatent",
     "PrototypeTaskLatent",
     "StageTaskLatent",
     "extract_critic",

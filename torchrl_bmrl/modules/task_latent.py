@@ -1,8 +1,8 @@
 """The task embedding m: the encoder that makes it, and where m comes from when acting.
 
 Training embeds a transition (s, a, r, s'); an acting policy does not have the present one yet.
-Three environment transforms write ``task_latent`` for it: :class:`PrototypeTaskLatent`,
-:class:`OnlineTaskLatent` and :class:`DemonstrationTaskLatent`.
+Environment transforms write ``task_latent`` for it: :class:`PrototypeTaskLatent`,
+:class:`OnlineTaskLatent`, :class:`DemonstrationTaskLatent` and :class:`PathTaskLatent`.
 """
 
 from __future__ import annotations
@@ -300,3 +300,55 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Not defined outside an environment: the alignment needs an episode."""
         raise BMRLError("DemonstrationTaskLatent acts in an environment, not on stored data")
+
+
+class PathTaskLatent(PrototypeTaskLatent):
+    """Writes the points of a path, one a step, and its last one beyond the end.
+
+    Args:
+        points: the path of every environment, ``(T, m)``, or of each of a batch, ``(*B, T, m)``;
+            a path of one point is held through the episode.
+
+    Raises:
+        BMRLError: if there is no point; at a reset, if the batch of paths is not the environment's.
+
+    Example:
+        >>> PathTaskLatent(torch.linspace(0, 1, 5).unsqueeze(-1)).task_latent
+        tensor([0.])
+    """
+
+    def __init__(self, points: Tensor) -> None:
+        if points.ndim < 2 or not points.shape[-2]:
+            raise BMRLError(f"points have shape {tuple(points.shape)}; valid: (*B, T, m), T > 0")
+        super().__init__(points[..., 0, :])
+        self.register_buffer("points", points.detach().clone())
+        self._time = torch.zeros((), dtype=torch.int64)
+
+    def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
+        batch, (length, size) = tensordict.batch_size, self.points.shape[-2:]
+        index = self._time.clamp(max=length - 1).reshape(*batch, 1, 1).expand(*batch, 1, size)
+        latent = self.points.expand(*batch, length, size).gather(-2, index).squeeze(-2)
+        return tensordict.set("task_latent", latent)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        shape, paths = tensordict_reset.batch_size, self.points.shape[:-2]
+        if paths and paths != shape:
+            raise BMRLError(
+                f"paths of batch {tuple(paths)} in an environment of {tuple(shape)}; valid: one "
+                "path, or one for each"
+            )
+        start = torch.zeros(shape, dtype=torch.int64, device=self.points.device)
+        reset = None if tensordict is None else tensordict.get("_reset", None)
+        # Of several environments some may restart while others go on.
+        self._time = start if reset is None else self._time.masked_fill(reset.reshape(shape), 0)
+        return self._write(tensordict_reset)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._time = self._time + 1
+        return self._write(next_tensordict)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Not defined outside an environment: a path needs an episode."""
+        raise BMRLError("PathTaskLatent acts in an environment, not on stored data")

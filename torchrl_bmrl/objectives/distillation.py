@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams, unravel_key
@@ -15,6 +16,7 @@ from torch.nn import functional as F
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.functional import (
     direction_error,
+    isometry_error,
     sample_action_latent,
     squared_error,
     triplet_error,
@@ -26,6 +28,7 @@ from torchrl_bmrl.objectives.checks import (
     check_number,
     check_same_shape,
     entry,
+    next_key,
     output,
     read,
 )
@@ -49,14 +52,19 @@ class MetaDistillationLoss(KeyedLoss):
           + w_q \left(\hat Q(s, \hat g, m) - \tilde Q_i(s, g)\right)^2
           + w_m \lVert m \rVert_2^2
           + w_t \max(0, \lVert m - m^+ \rVert - \lVert m - m^- \rVert + \alpha)
+          + w_s \left(\lVert m - m^+ \rVert - \lVert c - c^+ \rVert\right)^2,
+          \quad c = (r / \rho_i, G_i(s, 0))
 
     Deviations from the paper, each of which a weight or an argument turns off: the penalty on m
     (cross-entropy alone lets m grow without bound), :math:`\tilde Q_i = (Q_i - \mu_i)/\sigma_i`
     (the teachers' values differ in scale), and ``context`` (an acting policy does not have the
     present transition). Off by default is the triplet loss of *Multi-task Batch Reinforcement
     Learning with Metric Learning* (https://arxiv.org/abs/1909.11373), where :math:`m^+` embeds
-    another transition of the task and :math:`m^-` one of another task. :math:`\hat Q` is trained
-    at :math:`\hat g` without a gradient into the student's generator.
+    another transition of the task and :math:`m^-` one of another task. Off by default, too, is
+    the last term: two transitions of a task lie as far apart in m as in c, their reward and the
+    teacher's action there, so that m tells how far the task has come (over all pairs of a task's
+    rows, m of the present transitions). :math:`\hat Q` is trained at :math:`\hat g` without a
+    gradient into the student's generator.
 
     The teachers are frozen: row i of the data is task i. Any decoder and critic will do, those of
     :class:`~torchrl_bmrl.objectives.BCQLoss` and :class:`~torchrl_bmrl.objectives.PLASLoss` alike;
@@ -75,6 +83,7 @@ class MetaDistillationLoss(KeyedLoss):
         latent_clip: bound on z; ``None`` for none. Default 0.5, as the teachers act.
         qvalue_loc: μ_i, ``(num_tasks,)``. Default 0.
         qvalue_scale: σ_i, ``(num_tasks,)``, positive. Default 1.
+        reward_scale: ρ_i, ``(num_tasks,)``, positive. Default 1.
         classification_weight: w_c.
         generator_weight: w_g.
         direction_weight: w_d.
@@ -82,9 +91,10 @@ class MetaDistillationLoss(KeyedLoss):
         latent_norm_weight: w_m.
         metric_weight: w_t. Default 0, which leaves the term out.
         metric_margin: α, in units of m.
+        isometry_weight: w_s. Default 0, which leaves the term out.
         encoder_terms: terms whose gradient reaches M, of ``"classification"``, ``"generator"``,
-            ``"direction"``, ``"qvalue"`` and ``"metric"``; by default all. The penalty on m always
-            does. ``("classification",)`` is the paper's reading.
+            ``"direction"``, ``"qvalue"`` and ``"metric"``; by default all. The penalty on m and
+            the isometry term always do. ``("classification",)`` is the paper's reading.
         context: which transition m is computed from: ``"current"`` (the paper's), ``"previous"``
             (the one before it in the episode, under the key ``"previous"``), ``"random"`` (another
             one of the task in the batch) or ``"set"`` (the mean over ``context_size`` such).
@@ -145,6 +155,7 @@ class MetaDistillationLoss(KeyedLoss):
             task_latent: the embedding m.
             task_logits: the classifier's output.
             task: class index y.
+            reward: under ``"next"``; read with ``isometry_weight`` alone.
             state_action_value: the critics' output.
             previous: where the previous transition lies.
             priority: written to the input.
@@ -156,6 +167,7 @@ class MetaDistillationLoss(KeyedLoss):
         task_latent: NestedKey = "task_latent"
         task_logits: NestedKey = "task_logits"
         task: NestedKey = "task"
+        reward: NestedKey = "reward"
         state_action_value: NestedKey = "state_action_value"
         previous: NestedKey = "previous"
         priority: NestedKey = "td_error"
@@ -189,6 +201,7 @@ class MetaDistillationLoss(KeyedLoss):
         latent_clip: float | None = 0.5,
         qvalue_loc: Tensor | None = None,
         qvalue_scale: Tensor | None = None,
+        reward_scale: Tensor | None = None,
         classification_weight: float = 1.0,
         generator_weight: float = 1.0,
         direction_weight: float = 1.0,
@@ -196,6 +209,7 @@ class MetaDistillationLoss(KeyedLoss):
         latent_norm_weight: float = 2e-3,
         metric_weight: float = 0.0,
         metric_margin: float = 1.0,
+        isometry_weight: float = 0.0,
         encoder_terms: Sequence[str] = ENCODER_TERMS,
         context: str = "set",
         context_fraction: float = 0.5,
@@ -227,6 +241,7 @@ class MetaDistillationLoss(KeyedLoss):
             if term not in ENCODER_TERMS:
                 raise UnknownNameError("encoder term", term, ENCODER_TERMS)
         check_number("metric_weight", metric_weight)
+        check_number("isometry_weight", isometry_weight)
         if metric_weight and len(teacher_generators) < 2:
             raise BMRLError("metric_weight needs at least two tasks, one to be away from")
         self.num_tasks = len(teacher_generators)
@@ -252,12 +267,13 @@ class MetaDistillationLoss(KeyedLoss):
         for name, given, default in (
             ("qvalue_loc", qvalue_loc, zeros),
             ("qvalue_scale", qvalue_scale, zeros + 1),
+            ("reward_scale", reward_scale, zeros + 1),
         ):
             buffer = default if given is None else torch.as_tensor(given).to(zeros)
-            if buffer.shape != zeros.shape or (name == "qvalue_scale" and not (buffer > 0).all()):
+            if buffer.shape != zeros.shape or (name.endswith("scale") and not (buffer > 0).all()):
                 raise BMRLError(
                     f"{name} is {buffer.tolist()}; valid: a number for each of the "
-                    f"{self.num_tasks} tasks{', above 0' * (name == 'qvalue_scale')}"
+                    f"{self.num_tasks} tasks{', above 0' * name.endswith('scale')}"
                 )
             self.register_buffer(name, buffer)
         for name, value in (
@@ -268,13 +284,20 @@ class MetaDistillationLoss(KeyedLoss):
             ("latent_norm_weight", latent_norm_weight),
         ):
             self.register_coefficients(**{name: check_number(name, value)})
-        self.register_coefficients(latent_clip=latent_clip, metric_weight=metric_weight or None)
+        self.register_coefficients(
+            latent_clip=latent_clip,
+            metric_weight=metric_weight or None,
+            isometry_weight=isometry_weight or None,
+        )
         self.keep_keys()
 
     def read_keys(self) -> list[NestedKey]:
         """The transition that m is computed from, what the teachers read, and the task."""
         keys = [*self.task_encoder.in_keys, *self._teacher_observation_keys]
         keys.append(self.tensor_keys.task)
+        if self.isometry_weight is not None:
+            reward = next_key(self.tensor_keys.reward)
+            keys += [reward] if reward not in keys else []
         if self.context == "previous":
             previous = self.tensor_keys.previous
             keys += [unravel_key((previous, key)) for key in self.task_encoder.in_keys]
@@ -289,6 +312,7 @@ class MetaDistillationLoss(KeyedLoss):
             "loss_qvalue",
             "loss_latent_norm",
             *(["loss_metric"] if self.metric_weight is not None else []),
+            *(["loss_isometry"] if self.isometry_weight is not None else []),
             "accuracy",
             "latent_norm",
         ]
@@ -357,11 +381,13 @@ class MetaDistillationLoss(KeyedLoss):
             dtype=self.qvalue_loc.dtype,
         )
         data = data.copy().set(keys.action_latent, latent)
-        for teachers in (self.teacher_generators, self.teacher_qvalue_networks):
-            data = teachers(data, randomness=self.vmap_randomness, loop=self.deactivate_vmap)
+        data = self._ask(self.teacher_qvalue_networks, self._ask(self.teacher_generators, data))
         value = data.get(keys.state_action_value)
         value = (value - self.qvalue_loc[:, None, None]) / self.qvalue_scale[:, None, None]
         return data.set(keys.state_action_value, value)
+
+    def _ask(self, teachers: Any, data: TensorDictBase) -> TensorDictBase:
+        return teachers(data, randomness=self.vmap_randomness, loop=self.deactivate_vmap)
 
     def imitate(self, taught: TensorDictBase, task_latent: Tensor) -> Tensor:
         """Student's action for the teachers' observations and latents."""
@@ -404,6 +430,19 @@ class MetaDistillationLoss(KeyedLoss):
         row = torch.randint(rows, (num_tasks, rows), device=device)
         return triplet_error(task_latent, near, task_latent[task, row], self.metric_margin)
 
+    def spread_out(self, tensordict: TensorDictBase) -> Tensor:
+        """Error of each row's distances in m to its task's other rows, ``(num_tasks, B)``."""
+        reward = entry(tensordict, next_key(self.tensor_keys.reward))
+        with torch.no_grad():
+            # What the demonstrator did, without its noise.
+            data = tensordict.select(*self._teacher_observation_keys)
+            centre = self.qvalue_loc.new_zeros(*data.batch_size, self.latent_dim)
+            data = data.copy().set(self.tensor_keys.action_latent, centre)
+            action = self._ask(self.teacher_generators, data).get(self.tensor_keys.action)
+        content = torch.cat([reward / self.reward_scale[:, None, None], action], -1)
+        # Not embed's: m of a set has no reward and action of its own.
+        return isometry_error(self._encode(tensordict.select(*self.task_encoder.in_keys)), content)
+
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the weighted terms; see the class for keys."""
@@ -445,6 +484,8 @@ class MetaDistillationLoss(KeyedLoss):
         }
         if self.metric_weight is not None:
             terms["loss_metric"] = self.metric_weight * self.separate(reaching["metric"])
+        if self.isometry_weight is not None:
+            terms["loss_isometry"] = self.isometry_weight * self.spread_out(tensordict)
         tensordict.set(self.tensor_keys.priority, sum(terms.values()).detach())
         losses = {name: self.reduce(term, tensordict) for name, term in terms.items()}
         losses["accuracy"] = (logits.argmax(-1) == task).to(logits.dtype).mean()

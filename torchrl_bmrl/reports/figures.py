@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Circle, Patch
 from numpy.typing import NDArray
 
 from torchrl_bmrl.errors import BMRLError
@@ -125,24 +128,7 @@ def embedding_tsne(
         >>> embedding_tsne(points, np.arange(20) % 6)[1:4]
         b'PNG'
     """
-    from sklearn.manifold import TSNE
-    from threadpoolctl import threadpool_limits
-
-    count = len(task_latent)
-    if count < 4:
-        raise BMRLError(f"t-SNE needs at least 4 embeddings, got {count}")
-    chosen = np.arange(count)
-    if count > 3000:
-        chosen = np.sort(np.random.default_rng(seed).choice(count, 3000, replace=False))
-    tsne = TSNE(
-        n_components=2,
-        perplexity=min(30.0, (len(chosen) - 1) / 3),
-        init="pca" if np.shape(task_latent)[1] >= 2 else "random",  # PCA keeps the overall layout
-        random_state=seed,
-    )
-    # Several threads add up in an order that changes from run to run, and so would the map.
-    with threadpool_limits(limits=1):
-        points = tsne.fit_transform(np.asarray(task_latent, dtype=np.float64)[chosen])
+    chosen, points = _tsne(task_latent, seed)
     figure, axes = _square()
     _scatter_by_task(axes, points, task[chosen])
     axes.set_title(f"t-SNE of the task embedding m ({len(chosen):,} transitions)", fontsize=11)
@@ -151,11 +137,64 @@ def embedding_tsne(
     return _png(figure)
 
 
+def embedding_stages(
+    task_latent: NDArray[Any],
+    phase: NDArray[np.integer[Any]],
+    stage: NDArray[np.integer[Any]],
+    phase_names: Sequence[str],
+    *,
+    seed: int = 0,
+) -> bytes:
+    """A t-SNE map of one task's embeddings: recorded phases beside the groups that were found.
+
+    Args:
+        task_latent: Embeddings m of the task's transitions, shape ``(N, d)``, N of at least 4.
+        phase: The expert's phase, shape ``(N,)``, an index into ``phase_names``.
+        stage: Group of each transition, shape ``(N,)``.
+        phase_names: Names of the phases.
+        seed: Seed of t-SNE.
+
+    Returns:
+        PNG image.
+
+    Example:
+        >>> points = np.random.default_rng(0).normal(size=(20, 2))
+        >>> embedding_stages(points, np.arange(20) % 2, np.arange(20) % 2, ["a", "b"])[1:4]
+        b'PNG'
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    count = len(phase_names)
+    shared = np.array(
+        [[((phase == i) & (stage == j)).sum() for j in range(count)] for i in range(count)]
+    )
+    # Groups have no names: they take the phases' colors so that most points keep theirs.
+    named = np.argsort(linear_sum_assignment(-shared)[1])
+    chosen, points = _tsne(task_latent, seed)
+    figure = Figure(figsize=(9.4, 4.9), layout="constrained")
+    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+    colors = np.array(_OKABE_ITO)
+    for axes, label, title in (
+        (left, phase[chosen], "recorded phase of the expert"),
+        (right, named[stage[chosen]], "group found without labels"),
+    ):
+        _tidy(axes)
+        axes.scatter(*points.T, c=colors[label % len(colors)], s=12, alpha=0.8, linewidths=0)
+        axes.set_title(title, fontsize=11)
+        axes.set_xlabel("t-SNE 1 (no unit)")
+    left.set_ylabel("t-SNE 2 (no unit)")
+    _legend_below(
+        left, [_dot(name, "o", colors[i % len(colors)]) for i, name in enumerate(phase_names)]
+    )
+    return _png(figure)
+
+
 def reach_trajectories(
     task_latent: NDArray[Any],
     episode: NDArray[np.integer[Any]],
     distance: NDArray[np.floating[Any]],
     *,
+    success_point: NDArray[Any] | None = None,
     max_episodes: int = 12,
 ) -> bytes:
     """Episodes as lines through the embedding, coloured by distance to the goal (figure 5).
@@ -165,6 +204,8 @@ def reach_trajectories(
             in the order of time; with d > 2 their first two principal components are drawn.
         episode: Episode of each transition, shape ``(N,)``.
         distance: End effector to goal, shape ``(N,)``, [m].
+        success_point: Where the task succeeds in the embedding, shape ``(d,)``: the centre of
+            circles, each as wide as the embeddings at its distance to the goal are away from it.
         max_episodes: The first so many episodes are drawn; more are hard to tell apart.
 
     Returns:
@@ -179,7 +220,10 @@ def reach_trajectories(
     drawn = np.unique(episode)[:max_episodes]
     if drawn.size == 0:
         raise BMRLError("no trajectory to draw: there is no transition")
-    points, note = _plane(task_latent)
+    # The point goes through the same projection as the transitions.
+    center = np.empty((0, np.shape(task_latent)[1])) if success_point is None else success_point
+    points, note = _plane(np.concatenate([task_latent, np.atleast_2d(center)]))
+    points, center = points[: len(task_latent)], points[len(task_latent) :]
     figure, axes = _square()
     farthest = float(distance[np.isin(episode, drawn)].max())
     for number in drawn:
@@ -198,7 +242,11 @@ def reach_trajectories(
         )
         axes.plot(*path[0], "o", color="white", markeredgecolor="black", markersize=6, zorder=3)
         axes.plot(*path[-1], "*", color="#D55E00", markeredgecolor="black", markersize=12, zorder=4)
-    figure.colorbar(dots, ax=axes, label="Distance to the goal [m]", shrink=0.85)
+    bar = figure.colorbar(dots, ax=axes, label="Distance to the goal [m]", shrink=0.85)
+    for level, radius in _level_sets(points, center, distance) if len(center) else ():
+        color = dots.to_rgba(np.array([level]))[0]
+        axes.add_patch(Circle(center[0], radius, fill=False, color=color, linewidth=1.5, zorder=2))
+        bar.ax.axhline(level, color="white", linewidth=1.0)
     _legend_below(
         axes,
         [
@@ -244,6 +292,44 @@ def success_curves(curves: Mapping[str, Sequence[NDArray[Any]]], *, title: str) 
     axes.set_title(title, fontsize=11)
     figure.legend(loc="outside lower center", ncols=len(curves), frameon=False, fontsize=9)
     return _png(figure)
+
+
+def _level_sets(
+    points: NDArray[np.float64], center: NDArray[np.float64], distance: NDArray[np.floating[Any]]
+) -> list[tuple[float, float]]:
+    """Distances to the goal [m], and how far from the center the transitions there lie."""
+    away = np.linalg.norm(points - center, axis=1)
+    edges = np.linspace(0.0, float(distance.max()), 5)
+    bands = [(distance >= low) & (distance <= high) for low, high in pairwise(edges)]
+    return [
+        (float(np.median(distance[band])), float(np.median(away[band])))
+        for band in bands
+        if band.sum() >= 3
+    ]
+
+
+def _tsne(
+    task_latent: NDArray[Any], seed: int
+) -> tuple[NDArray[np.integer[Any]], NDArray[np.float64]]:
+    """Which embeddings were drawn at random, at most 3000, and their map ``(N, 2)``."""
+    from sklearn.manifold import TSNE
+    from threadpoolctl import threadpool_limits
+
+    count = len(task_latent)
+    if count < 4:
+        raise BMRLError(f"t-SNE needs at least 4 embeddings, got {count}")
+    chosen = np.arange(count)
+    if count > 3000:
+        chosen = np.sort(np.random.default_rng(seed).choice(count, 3000, replace=False))
+    tsne = TSNE(
+        n_components=2,
+        perplexity=min(30.0, (len(chosen) - 1) / 3),
+        init="pca" if np.shape(task_latent)[1] >= 2 else "random",  # PCA keeps the overall layout
+        random_state=seed,
+    )
+    # Several threads add up in an order that changes from run to run, and so would the map.
+    with threadpool_limits(limits=1):
+        return chosen, tsne.fit_transform(np.asarray(task_latent, dtype=np.float64)[chosen])
 
 
 def _plane(task_latent: NDArray[Any]) -> tuple[NDArray[np.float64], str]:
@@ -331,3 +417,97 @@ def _png(figure: Figure) -> bytes:
     # Without this the file names matplotlib's version, and equal pictures differ.
     figure.savefig(data, format="png", dpi=_DPI, metadata={"Software": None})
     return data.getvalue()
+
+
+def behaviour_trajectories(
+    positions: Mapping[str, NDArray[Any]], along: Mapping[str, NDArray[Any]]
+) -> bytes:
+    """End-effector trajectories of several methods, from above and from the side.
+
+    Args:
+        positions: By the method's name, relative to each episode's start, shape ``(N, T, 3)`` [m].
+        along: How far along its path m was, 0 to 1, shape ``(N, 1)`` or ``(N, T)``; where it is
+            not a number, the trajectory is grey.
+
+    Returns:
+        PNG image.
+
+    Example:
+        >>> line = np.linspace(0.0, 0.1, 12).reshape(2, 2, 3)
+        >>> behaviour_trajectories({"straight": line}, {"straight": np.array([[0.5], [1.0]])})[1:4]
+        b'PNG'
+    """
+    if not positions:
+        raise BMRLError("no trajectory to draw: there is no method")
+    count = len(positions)
+    figure = Figure(figsize=(max(2.4 * count, 5.0), 5.2), layout="constrained")
+    panels = figure.subplots(2, count, squeeze=False, sharex="row", sharey="row")
+    norm = Normalize(0, 1)
+    for column, (name, paths) in enumerate(positions.items()):
+        x, y, z = np.moveaxis(np.asarray(paths, dtype=np.float64), -1, 0)
+        color = np.broadcast_to(along[name][:, : x.shape[1]], x.shape)
+        known = np.isfinite(color)
+        # From above with the robot at the bottom: its left, +y, is to the left.
+        for axes, a, b in ((panels[0, column], y, x), (panels[1, column], y, z)):
+            axes.scatter(a[~known], b[~known], color=_GREY, s=2, alpha=0.4, linewidths=0)
+            axes.scatter(a[known], b[known], c=color[known], norm=norm, s=2, linewidths=0)
+            axes.plot(0, 0, "+", color="black", markersize=8)
+            axes.set_aspect("equal")
+            _tidy(axes)
+        panels[0, column].set_title(name, fontsize=10)
+        panels[1, column].set_xlabel("to the left [m]", fontsize=9)
+    for axes in panels[:, 0]:
+        axes.invert_xaxis()  # shared along the row
+    panels[0, 0].set_ylabel("from above: away [m]", fontsize=9)
+    panels[1, 0].set_ylabel("from behind: up [m]", fontsize=9)
+    figure.colorbar(
+        ScalarMappable(norm), ax=panels, label="Position along the interpolation", shrink=0.7
+    )
+    return _png(figure)
+
+
+def embedding_paths(
+    task_latent: NDArray[Any],
+    task: NDArray[np.integer[Any]],
+    paths: Mapping[str, Sequence[NDArray[Any]]],
+    points: NDArray[Any],
+) -> bytes:
+    """The embedding with paths through it: straight ones dashed, others solid.
+
+    Args:
+        task_latent: Embeddings m of transitions, shape ``(N, d)``; with d > 2 the first two
+            principal components of everything shown are drawn.
+        task: Class index of each transition, shape ``(N,)``.
+        paths: By kind, ``"straight"`` or another, shape ``(P, d)`` each.
+        points: Single points of m, shape ``(K, d)``.
+
+    Returns:
+        PNG image.
+
+    Example:
+        >>> paths = {"straight": [np.eye(2, 2)]}
+        >>> embedding_paths(np.eye(3, 2), np.array([0, 1, 5]), paths, np.zeros((1, 2)))[1:4]
+        b'PNG'
+    """
+    flat = [(kind, path) for kind, some in paths.items() for path in some]
+    parts = [task_latent, points, *(path for _, path in flat)]
+    plane, note = _plane(np.concatenate(parts))
+    drawn = np.split(plane, np.cumsum([len(part) for part in parts])[:-1])
+    figure, axes = _square()
+    _scatter_by_task(axes, drawn[0], task)
+    axes.plot(*drawn[1].T, "x", color="black", markersize=4, label="random points")
+    for (kind, _), path in zip(flat, drawn[2:], strict=True):
+        style = "--" if kind == "straight" else "-"
+        axes.plot(*path.T, style, color="black", linewidth=1.2)
+        axes.plot(*path[-1], "s", color="white", markeredgecolor="black", markersize=6, zorder=4)
+    if flat:
+        axes.plot(
+            *drawn[2][0], "*", color="white", markeredgecolor="black", markersize=13, zorder=5
+        )
+    axes.set_title(
+        "Paths through the embedding: straight (dashed), on the data (solid);\n"
+        f"from the star to the squares, prototypes; crosses: random points{note}",
+        fontsize=10,
+    )
+    _name_axes(axes, note)
+    return _png(figure)

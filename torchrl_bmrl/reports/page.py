@@ -1,4 +1,4 @@
-"""One HTML page that works from disk: no script, no network, pictures inside."""
+"""One HTML page that works from disk: no network; pictures, data and script are inside."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from jinja2 import Environment, StrictUndefined
 
 from torchrl_bmrl.files import write_atomic
+from torchrl_bmrl.reports.explorer import Explorer, style
 from torchrl_bmrl.reports.tables import Table
 
 _TEMPLATE = """\
@@ -18,6 +19,10 @@ _TEMPLATE = """\
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light">
+{# The browser itself refuses whatever is not inside. #}
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; \
+style-src 'unsafe-inline'; script-src 'unsafe-inline'">
 <title>{{ title }}</title>
 <style>
   body { margin: 2.5rem auto; max-width: 74rem; padding: 0 1.25rem; color: #1d2129;
@@ -40,7 +45,7 @@ _TEMPLATE = """\
   th { border-bottom: 2px solid #1d2129; vertical-align: bottom; white-space: normal; }
   td { border-bottom: 1px solid #e4e7eb; }
   .number { text-align: right; }
-</style>
+{{ style | safe }}</style>
 </head>
 <body>
 <h1>{{ title }}</h1>
@@ -60,6 +65,9 @@ _TEMPLATE = """\
 {% for table in section.tables %}
 {{ table.html() | safe }}
 {% endfor %}
+{% if section.explorer %}
+{{ section.explorer.html() | safe }}
+{% endif %}
 {% for picture in section.pictures %}
 <figure>
 <img src="data:image/png;base64,{{ picture.base64() }}" alt="{{ picture.alt }}">
@@ -98,18 +106,20 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A part of the page: a heading, then text, tables and pictures, in this order.
+    """A part of the page: a heading, then text, tables, an explorer and pictures, in this order.
 
     Args:
         heading: Heading.
         paragraphs: Text.
         tables: Tables.
+        explorer: What can be explored.
         pictures: Pictures.
     """
 
     heading: str
     paragraphs: Sequence[str] = ()
     tables: Sequence[Table] = ()
+    explorer: Explorer | None = None
     pictures: Sequence[Picture] = ()
 
 
@@ -139,4 +149,6 @@ def write_page(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     template = environment.from_string(_TEMPLATE)
-    write_atomic(path, template.render(title=title, facts=facts, sections=sections))
+    css = style() if any(section.explorer for section in sections) else ""
+    page = template.render(title=title, facts=facts, sections=sections, style=css)
+    write_atomic(path, page)

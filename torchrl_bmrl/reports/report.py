@@ -5,69 +5,46 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from torchrl_bmrl.errors import BMRLError, DataError
+from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.evaluation.embedding import STAGE_TAIL
 from torchrl_bmrl.evaluation.results import Summary, read_results, summarise
 from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports import paper
+from torchrl_bmrl.reports.embedding import (
+    EMBEDDING,
+    Embeddings,
+    measure_goal_distance,
+    measure_stages,
+    name_stages,
+    success_point,
+)
+from torchrl_bmrl.reports.explorer import Explorer
 from torchrl_bmrl.reports.figures import (
     Curve,
     embedding_scatter,
+    embedding_stages,
     embedding_tsne,
     reach_trajectories,
     stage1_curves,
 )
 from torchrl_bmrl.reports.page import Picture, Section, write_page
-from torchrl_bmrl.reports.tables import results_table, table_1, table_2, task_name
+from torchrl_bmrl.reports.studies import read_studies
+from torchrl_bmrl.reports.tables import (
+    Table,
+    goal_distance_table,
+    results_table,
+    stages_table,
+    table_1,
+    table_2,
+    task_name,
+)
 
 _CURVE_FIELDS = ("epoch", "update", "return")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Embeddings:
-    """Embedded transitions, row by row.
-
-    Args:
-        task_latent: Embeddings m, shape ``(N, d)``.
-        task: Class index, shape ``(N,)``.
-        episode: Episode within its task, shape ``(N,)``.
-        step: Step within its episode, shape ``(N,)``.
-        distance: End effector to goal, shape ``(N,)``, [m].
-
-    Raises:
-        BMRLError: if the shapes do not fit, or an embedding or a distance is not finite.
-
-    Example:
-        >>> zeros = np.zeros(3, dtype=int)
-        >>> Embeddings(
-        ...     task_latent=np.zeros((3, 2)), task=zeros, episode=zeros, step=zeros, distance=zeros
-        ... ).task_latent.shape
-        (3, 2)
-    """
-
-    task_latent: NDArray[Any]
-    task: NDArray[np.integer[Any]]
-    episode: NDArray[np.integer[Any]]
-    step: NDArray[np.integer[Any]]
-    distance: NDArray[np.floating[Any]]
-
-    def __post_init__(self) -> None:
-        if self.task_latent.ndim != 2 or self.task_latent.shape[1] == 0:
-            raise BMRLError(f"task_latent must have shape (N, d), got {self.task_latent.shape}")
-        expected = (len(self.task_latent),)
-        for name in ("task", "episode", "step", "distance"):
-            if (shape := getattr(self, name).shape) != expected:
-                raise BMRLError(f"{name} must have shape {expected}, got {shape}")
-        for name in ("task_latent", "distance"):
-            if not np.isfinite(getattr(self, name)).all():
-                raise BMRLError(f"{name} must be finite; it holds NaN or infinite values")
 
 
 def read_stage1_curves(run_dir: Path) -> dict[str, Curve]:
@@ -97,29 +74,34 @@ def write_report(
     default_source: str,
     facts: Mapping[str, str],
     embeddings: Embeddings | None = None,
+    training: Embeddings | None = None,
     accuracy: float | None = None,
+    explorer: Explorer | None = None,
     seed: int = 0,
 ) -> Path:
     """Writes tables, figures and ``report.html`` of a run folder from its ``results.csv``.
 
-    Written are ``tables/{results,table1,table2}.{md,csv}``, ``figures/*.png`` and ``report.html``,
-    each atomically and after everything has been computed. A figure without data is left out, and
-    the page says so.
+    Written are ``tables/{results,table1,table2}.{md,csv}``, with ``training`` also
+    ``tables/{stages,goal_distance}.{md,csv}``, ``figures/*.png`` and ``report.html``, each
+    atomically and after everything has been computed. A figure without data is left out, and the
+    page says so. Studies that the folder holds are shown.
 
     Args:
         run_dir: The run folder, with ``results.csv`` and, for the training curves,
             ``bcq/<task>/evaluations.csv`` (columns epoch, update, episode, return, success).
         default_source: Source of m that comes first in the tables.
         facts: Names and values for the box at the top of the page.
-        embeddings: Transitions to draw, from held-out data.
+        embeddings: Transitions to draw and to measure, from held-out data.
+        training: Transitions of the training data, which stages and success points come from.
         accuracy: Held-out classification accuracy of the embedding, in [0, 1].
+        explorer: Transitions to explore, from held-out data.
         seed: Seed of t-SNE.
 
     Returns:
         Path of the page.
 
     Raises:
-        DataError: if ``results.csv`` or a file of training curves is missing or not valid.
+        DataError: if ``results.csv``, a file of training curves or a study is missing or not valid.
     """
     run_dir = Path(run_dir)
     summaries = summarise(read_results(run_dir / "results.csv"))
@@ -132,12 +114,13 @@ def write_report(
         "table2": table_2(summaries, default_source=default_source),
     }
     stage1, note1 = _draw_stage1(curves, summaries)
-    stage2, note2 = _draw_embeddings(embeddings, seed=seed)
+    stage2, note2 = _draw_embeddings(embeddings, training, seed=seed)
+    known, drawn, note3 = _measure_embeddings(embeddings, training, seed=seed)
 
-    for name, table in tables.items():
+    for name, table in {**tables, **known}.items():
         write_atomic(run_dir / "tables" / f"{name}.md", table.markdown())
         write_atomic(run_dir / "tables" / f"{name}.csv", table.csv())
-    for name, picture in {**stage1, **stage2}.items():
+    for name, picture in {**stage1, **stage2, **drawn}.items():
         write_atomic(run_dir / "figures" / f"{name}.png", picture.png)
     page = run_dir / "report.html"
     write_page(
@@ -159,10 +142,25 @@ def write_report(
                 heading="Stage 2: one distilled policy for all tasks", tables=[tables["table2"]]
             ),
             Section(heading="The task embedding", paragraphs=note2, pictures=list(stage2.values())),
+            *_explore(explorer),
+            Section(
+                heading="What the embedding knows",
+                paragraphs=note3,
+                tables=list(known.values()),
+                pictures=list(drawn.values()),
+            ),
+            *read_studies(run_dir),
             Section(heading="Everything measured", tables=[tables["results"]]),
         ],
     )
     return page
+
+
+def _explore(explorer: Explorer | None) -> list[Section]:
+    if explorer is None:
+        return []
+    heading = "Explore the embedding"
+    return [Section(heading=heading, paragraphs=explorer.paragraphs(), explorer=explorer)]
 
 
 def _headline(
@@ -238,14 +236,13 @@ def _draw_stage1(
 
 
 def _draw_embeddings(
-    embeddings: Embeddings | None, *, seed: int
+    embeddings: Embeddings | None, training: Embeddings | None, *, seed: int
 ) -> tuple[dict[str, Picture], list[str]]:
     """The pictures of the embedding, and a sentence on what is missing."""
     if embeddings is None:
         return {}, ["The figures of the embedding are left out: no embeddings were given."]
-    # In time order, whatever order the transitions came in.
-    order = np.lexsort((embeddings.step, embeddings.episode, embeddings.task))
-    latent, task = embeddings.task_latent[order], embeddings.task[order]
+    embeddings = embeddings.in_time()
+    latent, task = embeddings.task_latent, embeddings.task
     pictures = {
         "embedding": Picture(
             png=embedding_scatter(latent, task),
@@ -266,21 +263,65 @@ def _draw_embeddings(
             ),
         ),
     }
-    reach = task == TASKS.index("reach")
-    if not reach.any():
+    reach = embeddings.on_the_way("reach")
+    if not len(reach.task):
         return pictures, ["The reach trajectories are left out: no reach transition was given."]
+    center = None if training is None else success_point(training, "reach")
     pictures["reach_trajectories"] = Picture(
         png=reach_trajectories(
-            latent[reach], embeddings.episode[order][reach], embeddings.distance[order][reach]
+            reach.task_latent,
+            reach.episode,
+            reach.distance,
+            success_point=None if center is None else center[EMBEDDING],
         ),
         alt="Lines through the embedding, one per reach episode, coloured by distance to the goal",
         caption=(
-            "Reach episodes as lines through the embedding, from circle to star. If the embedding "
-            "holds the progress of the task, the lines end in one place and points of one colour "
-            "lie on a curve around it. Compare the paper's figure 5."
+            "Reach episodes as lines through the embedding, from circle to star, up to their first "
+            "success. If the embedding holds the progress of the task, the lines end in one place "
+            "and points of one colour lie on a circle around it. The circles, where drawn, are "
+            "centred on the success point of the training demonstrations; each has the colour of a "
+            "distance to the goal, and the radius that transitions there have in the middle. "
+            "Compare the paper's figure 5."
         ),
     )
     return pictures, []
+
+
+def _measure_embeddings(
+    embeddings: Embeddings | None, training: Embeddings | None, *, seed: int
+) -> tuple[dict[str, Table], dict[str, Picture], list[str]]:
+    """Tables and the picture of what the embedding knows, and sentences on what is missing."""
+    if embeddings is None or training is None:
+        return {}, {}, ["Stages and distances are left out: no training transitions were given."]
+    notes = []
+    tables = {}
+    if stages := measure_stages(training, embeddings, seed=seed):
+        tables["stages"] = stages_table(stages)
+    else:
+        notes.append("The stages are left out: no phases of the expert were recorded.")
+    if distances := measure_goal_distance(training, embeddings, seed=seed):
+        tables["goal_distance"] = goal_distance_table(distances)
+    else:
+        notes.append("The distances are left out: no training demonstration succeeds.")
+    way = embeddings.on_the_way("lift", tail=STAGE_TAIL)
+    if "lift" not in [result.task for result in stages] or len(way.task) < 4:
+        return tables, {}, notes
+    picture = Picture(
+        png=embedding_stages(
+            way.task_latent,
+            way.phase,
+            name_stages(training, embeddings, "lift", seed=seed)[EMBEDDING],
+            embeddings.phase_names["lift"],
+            seed=seed,
+        ),
+        alt="Two t-SNE maps of lift's embeddings: by recorded phase, and by group found",
+        caption=(
+            "t-SNE of the embeddings of lift, held-out episodes until half a second after their "
+            "first success: by the phase that the expert recorded, and by the group found without "
+            "it. Compare the paper's figure 4b."
+        ),
+    )
+    return tables, {"embedding_stages": picture}, notes
 
 
 def _read_curve(path: Path) -> Curve:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 
+from torchrl_bmrl.evaluation.embedding import GoalDistanceResult, StageResult
 from torchrl_bmrl.evaluation.results import Summary
 from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports import paper
@@ -233,6 +234,92 @@ def table_2(summaries: Sequence[Summary], *, default_source: str) -> Table:
         header=("Task", "Paper: return", "Paper: % of BCQ", *measured),
         rows=rows,
     )
+
+
+def stages_table(results: Sequence[StageResult]) -> Table:
+    """Groups found without labels against the experts' recorded phases.
+
+    Args:
+        results: What :func:`torchrl_bmrl.reports.measure_stages` returns.
+
+    Example:
+        >>> stages_table([]).header[:2]
+        ('Task', 'Phases')
+    """
+    names = _representations([r.agreement for r in results])
+    return Table(
+        title="Stages found without labels",
+        caption=(
+            "Adjusted mutual information of the groups that a mixture of Gaussians finds in a "
+            "task's transitions and the phases that the expert recorded: 1 where either tells the "
+            "other, 0 by chance. Groups, as many as phases, are fitted to the training "
+            "demonstrations and named on the held-out ones, until half a second after each "
+            "episode's first success. "
+            "Brackets hold 95% bootstrap intervals over episodes. Beside the embedding, the same "
+            "of what the encoder reads (the normalised transition) and of an encoder that was "
+            "never trained."
+        ),
+        header=("Task", "Phases", *map(str.capitalize, names), "Episodes", "Transitions"),
+        rows=[
+            (
+                task_name(r.task),
+                ", ".join(r.phases),
+                *(str(r.agreement[name]) for name in names),
+                str(r.episodes),
+                str(r.transitions),
+            )
+            for r in results
+        ],
+    )
+
+
+def goal_distance_table(results: Sequence[GoalDistanceResult]) -> Table:
+    """Distances to the success point in the embedding against distances to the goal.
+
+    Args:
+        results: What :func:`torchrl_bmrl.reports.measure_goal_distance` returns.
+
+    Example:
+        >>> goal_distance_table([]).header[0]
+        'Task'
+    """
+    names = _representations([r.correlation for r in results])
+    return Table(
+        title="Distance to the goal in the embedding",
+        caption=(
+            "Spearman's correlation of a transition's distance to its task's success point (the "
+            "mean over first successes in the training demonstrations) and the end effector's "
+            "distance to the goal, in each held-out episode up to its first success: mean over "
+            "episodes, 95% bootstrap interval over episodes, and the lowest episode. Beside the "
+            "embedding, the same of what the encoder reads and of an encoder that was never "
+            "trained. Spread: how far apart the episodes lie in the embedding at their first "
+            "success, over how far apart they lie at their start; below 1 they come together."
+        ),
+        header=(
+            "Task",
+            *map(str.capitalize, names),
+            "Lowest episode",
+            "Spread, success over start",
+            "Episodes",
+            "Transitions",
+        ),
+        rows=[
+            (
+                task_name(r.task),
+                *(str(r.correlation[name]) for name in names),
+                f"{r.lowest:.2f}",
+                MISSING if r.spread is None else str(r.spread),
+                str(r.episodes),
+                str(r.transitions),
+            )
+            for r in results
+        ],
+    )
+
+
+def _representations(results: Sequence[Mapping[str, object]]) -> list[str]:
+    """Names of what was measured, in the order in which they were."""
+    return list(dict.fromkeys(name for result in results for name in result))
 
 
 def _by_key(summaries: Sequence[Summary]) -> dict[tuple[str, str, str], Summary]:

@@ -1,0 +1,223 @@
+"""Embedded transitions, and what is measured on them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.evaluation.embedding import (
+    STAGE_TAIL,
+    GoalDistanceResult,
+    StageResult,
+    distance_correlations,
+    find_stages,
+    mean_estimate,
+    spread_ratio,
+    stage_agreement,
+    until_success,
+)
+from torchrl_bmrl.names import TASKS
+
+EMBEDDING = "embedding"
+"""What the results of m itself are under, beside those of ``Embeddings.baselines``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Embeddings:
+    """Embedded transitions, row by row.
+
+    Args:
+        task_latent: Embeddings m, shape ``(N, d)``.
+        task: Class index, shape ``(N,)``.
+        episode: Episode within its task, shape ``(N,)``.
+        step: Step within its episode, shape ``(N,)``.
+        distance: End effector to goal, shape ``(N,)``, [m].
+        success: Whether the transition meets the task's goal, shape ``(N,)``; none does by default.
+        phase: The expert's phase, an index into its task's ``phase_names``, shape ``(N,)``; all
+            of them 0 by default.
+        phase_names: Names of the phases by task, for those tasks whose phases were recorded.
+        baselines: Other representations of the same transitions by name, each ``(N, k)``.
+
+    Raises:
+        BMRLError: if the shapes do not fit, an embedding or a distance is not finite, or a phase
+            has no name.
+
+    Example:
+        >>> zeros = np.zeros(3, dtype=int)
+        >>> Embeddings(
+        ...     task_latent=np.zeros((3, 2)), task=zeros, episode=zeros, step=zeros, distance=zeros
+        ... ).task_latent.shape
+        (3, 2)
+    """
+
+    task_latent: NDArray[Any]
+    task: NDArray[np.integer[Any]]
+    episode: NDArray[np.integer[Any]]
+    step: NDArray[np.integer[Any]]
+    distance: NDArray[np.floating[Any]]
+    success: NDArray[np.bool_] = None  # type: ignore[assignment]  # filled below
+    phase: NDArray[np.integer[Any]] = None  # type: ignore[assignment]
+    phase_names: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    baselines: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.task_latent.ndim != 2 or self.task_latent.shape[1] == 0:
+            raise BMRLError(f"task_latent must have shape (N, d), got {self.task_latent.shape}")
+        expected = (len(self.task_latent),)
+        for name, dtype in (("success", bool), ("phase", int)):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, np.zeros(expected, dtype=dtype))
+        for name in ("task", "episode", "step", "distance", "success", "phase"):
+            if (shape := getattr(self, name).shape) != expected:
+                raise BMRLError(f"{name} must have shape {expected}, got {shape}")
+        for name, values in {"task_latent": self.task_latent, **self.baselines}.items():
+            if values.ndim != 2 or len(values) != len(self.task_latent):
+                raise BMRLError(f"{name} must have shape ({expected[0]}, k), got {values.shape}")
+            if not np.isfinite(values).all():
+                raise BMRLError(f"{name} must be finite; it holds NaN or infinite values")
+        if not np.isfinite(self.distance).all():
+            raise BMRLError("distance must be finite; it holds NaN or infinite values")
+        for task, names in self.phase_names.items():
+            numbers = np.unique(self.phase[self.task == TASKS.index(task)])
+            if not np.isin(numbers, np.arange(len(names))).all():
+                raise BMRLError(
+                    f"phase holds {numbers.tolist()} for {task}; valid: 0 to {len(names) - 1}, "
+                    f"for {', '.join(names)}"
+                )
+
+    def rows(self, keep: NDArray[Any]) -> Embeddings:
+        """Some of the rows, by mask or by index."""
+        columns = [f.name for f in fields(self) if f.name not in ("phase_names", "baselines")]
+        return replace(
+            self,
+            **{name: getattr(self, name)[keep] for name in columns},
+            baselines={name: values[keep] for name, values in self.baselines.items()},
+        )
+
+    def in_time(self) -> Embeddings:
+        """The rows by task, episode and step, whatever order they came in."""
+        return self.rows(np.lexsort((self.step, self.episode, self.task)))
+
+    def on_the_way(self, task: str, *, tail: int = 0) -> Embeddings:
+        """A task's transitions up to the first of their episode that succeeds, in time.
+
+        Args:
+            task: its name.
+            tail: so many steps more.
+        """
+        own = self.rows(self.task == TASKS.index(task)).in_time()
+        return own.rows(until_success(own.success, own.episode, own.step, tail=tail))
+
+    @property
+    def representations(self) -> dict[str, NDArray[Any]]:
+        """The embedding and the baselines by name."""
+        return {EMBEDDING: self.task_latent, **self.baselines}
+
+
+def name_stages(
+    training: Embeddings, held_out: Embeddings, task: str, *, seed: int = 0
+) -> dict[str, NDArray[np.int64]]:
+    """Groups of a task's held-out transitions on the way, as many as it has phases.
+
+    Returns:
+        By representation, a group for each row of ``held_out.on_the_way(task, tail=STAGE_TAIL)``.
+    """
+    train, test = (x.on_the_way(task, tail=STAGE_TAIL) for x in (training, held_out))
+    return {
+        name: find_stages(
+            train.representations[name], points, len(held_out.phase_names[task]), seed=seed
+        )
+        for name, points in test.representations.items()
+    }
+
+
+def measure_stages(
+    training: Embeddings, held_out: Embeddings, *, seed: int = 0
+) -> list[StageResult]:
+    """Groups each task's transitions without labels, and holds them against recorded phases.
+
+    The groups are found in the training transitions and named on the held-out ones, for m and for
+    each baseline in the same way; there are as many as phases.
+
+    Args:
+        training: Transitions that groups are found in.
+        held_out: Transitions that the agreement is measured on.
+        seed: Seed of the groups and of the bootstrap.
+
+    Returns:
+        One result for each task with more than one phase and transitions of both kinds.
+    """
+    results = []
+    for task, phases in held_out.phase_names.items():
+        train, test = (x.on_the_way(task, tail=STAGE_TAIL) for x in (training, held_out))
+        if len(phases) < 2 or len(train.task) < len(phases) or not len(test.task):
+            continue
+        results.append(
+            StageResult(
+                task=task,
+                phases=phases,
+                agreement={
+                    name: stage_agreement(stage, test.phase, test.episode, seed=seed)
+                    for name, stage in name_stages(training, held_out, task, seed=seed).items()
+                },
+                episodes=len(np.unique(test.episode)),
+                transitions=len(test.task),
+            )
+        )
+    return results
+
+
+def success_point(training: Embeddings, task: str) -> dict[str, NDArray[Any]] | None:
+    """Where a task succeeds: the mean over each episode's first success, by representation.
+
+    Returns:
+        Point ``(k,)`` of the embedding and of each baseline; ``None`` if no episode succeeds.
+    """
+    way = training.on_the_way(task)
+    if not way.success.any():
+        return None
+    return {name: x[way.success].mean(0) for name, x in way.representations.items()}
+
+
+def measure_goal_distance(
+    training: Embeddings, held_out: Embeddings, *, seed: int = 0
+) -> list[GoalDistanceResult]:
+    """Holds distances to the success point against distances to the goal, task by task.
+
+    Args:
+        training: Transitions whose successes give the success point.
+        held_out: Transitions that are measured.
+        seed: Seed of the bootstrap.
+
+    Returns:
+        One result for each task with a success in training and held-out transitions.
+    """
+    results = []
+    for task in TASKS:
+        test, point = held_out.on_the_way(task), success_point(training, task)
+        if point is None or not len(test.task):
+            continue
+        each = {
+            name: distance_correlations(x, point[name], test.distance, test.episode)
+            for name, x in test.representations.items()
+        }
+        solved = np.unique(test.episode[test.success])
+        start = test.task_latent[(test.step == 0) & np.isin(test.episode, solved)]
+        end = test.task_latent[test.success]
+        met = len(solved) > 1 and len(start) == len(end) and np.ptp(start, axis=0).any()
+        results.append(
+            GoalDistanceResult(
+                task=task,
+                correlation={name: mean_estimate(x, seed=seed) for name, x in each.items()},
+                lowest=float(each[EMBEDDING].min()),
+                spread=spread_ratio(start, end, seed=seed) if met else None,
+                episodes=len(each[EMBEDDING]),
+                transitions=len(test.task),
+            )
+        )
+    return results

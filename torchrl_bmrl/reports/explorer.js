@@ -1,0 +1,371 @@
+// The embedding explorer: points of held-out episodes, one of which is chosen and played.
+// All text from data is set as textContent, never as markup.
+(() => {
+  "use strict";
+
+  const root = document.currentScript.closest(".explorer");
+  const part = (name) => root.querySelector(`[data-part="${name}"]`);
+  const data = JSON.parse(root.querySelector('script[type="application/json"]').textContent);
+  const canvas = part("canvas");
+  const context = canvas.getContext("2d");
+  const slider = part("slider");
+
+  const MARGIN = { left: 64, right: 14, top: 12, bottom: 50 }; // room for the axes [px]
+  const REACH = 14; // a point answers to a pointer this near [px]
+  const VIRIDIS = ["#440154", "#3b528b", "#21918c", "#5ec962", "#fde725"];
+  const FONT = '13px system-ui, "Segoe UI", Roboto, sans-serif';
+
+  // What is chosen. A point is an episode (its place in data.episodes) and a row of it.
+  const state = { task: -1, episode: 0, row: 0, hovered: null, playing: false };
+  let view = null; // from embedding to pixels
+  let background = null; // all points, drawn anew only when they change
+
+  // -- data -----------------------------------------------------------------------------------
+
+  const farthest = Math.max(...data.episodes.map((e) => Math.max(...e.distance)), 1e-9);
+  const seconds = (episode, row) => episode.step[row] * data.period;
+  const shown = () => data.episodes.filter((e) => state.task < 0 || e.task === state.task);
+  const hasFrames = (episode) => Object.keys(episode.frames).length > 0;
+
+  function color(episode, row) {
+    const coloring = part("coloring").value;
+    if (coloring === "phase") return data.phases[episode.phase[row]].color;
+    if (coloring === "distance") return viridis(episode.distance[row] / farthest);
+    return data.tasks[episode.task].color;
+  }
+
+  function viridis(share) {
+    const place = Math.min(Math.max(share, 0), 1) * (VIRIDIS.length - 1);
+    const index = Math.min(Math.floor(place), VIRIDIS.length - 2);
+    const channel = (hex, i) => parseInt(hex.slice(1 + 2 * i, 3 + 2 * i), 16);
+    const mix = [0, 1, 2].map((i) => {
+      const [a, b] = [channel(VIRIDIS[index], i), channel(VIRIDIS[index + 1], i)];
+      return Math.round(a + (place - index) * (b - a));
+    });
+    return `rgb(${mix.join(",")})`;
+  }
+
+  // The last picture taken at or before a row, as [step, base64].
+  function frameAt(episode, row) {
+    const steps = Object.keys(episode.frames).map(Number);
+    const before = steps.filter((step) => step <= episode.step[row]);
+    const step = before.length ? Math.max(...before) : steps[0];
+    return step === undefined ? null : [step, episode.frames[step]];
+  }
+
+  // -- drawing --------------------------------------------------------------------------------
+
+  function fit() {
+    const box = canvas.getBoundingClientRect();
+    const ratio = window.devicePixelRatio || 1;
+    canvas.width = Math.round(box.width * ratio);
+    canvas.height = Math.round(box.height * ratio);
+    const x = shown().flatMap((e) => e.x);
+    const y = shown().flatMap((e) => e.y);
+    const range = (values) => {
+      const low = values.reduce((a, b) => Math.min(a, b));
+      const high = values.reduce((a, b) => Math.max(a, b));
+      return [(low + high) / 2, high - low];
+    };
+    const [middleX, spanX] = range(x);
+    const [middleY, spanY] = range(y);
+    const width = box.width - MARGIN.left - MARGIN.right;
+    const height = box.height - MARGIN.top - MARGIN.bottom;
+    // Distances are what one reads off: one unit is as long both ways.
+    const scale = 0.94 * Math.min(width / (spanX || 1), height / (spanY || 1));
+    view = {
+      ratio, width, height, scale,
+      x: (value) => MARGIN.left + width / 2 + (value - middleX) * scale,
+      y: (value) => MARGIN.top + height / 2 - (value - middleY) * scale,
+      low: [middleX - width / 2 / scale, middleY - height / 2 / scale],
+      high: [middleX + width / 2 / scale, middleY + height / 2 / scale],
+    };
+  }
+
+  function ticks(low, high) {
+    const rough = (high - low) / 8;
+    const power = 10 ** Math.floor(Math.log10(rough));
+    const step = [1, 2, 5, 10].map((k) => k * power).find((s) => s >= rough);
+    const digits = Math.max(0, -Math.floor(Math.log10(step)));
+    const values = [];
+    for (let k = Math.ceil(low / step); k * step <= high; k += 1) values.push(k * step);
+    return values.map((value) => [value, value.toFixed(digits).replace("-", "−")]);
+  }
+
+  function drawAxes(pen) {
+    const [left, top] = [MARGIN.left, MARGIN.top];
+    const [right, bottom] = [left + view.width, top + view.height];
+    pen.font = FONT;
+    pen.fillStyle = "#1d2129";
+    pen.lineWidth = 1;
+    const line = (stroke, ...points) => {
+      pen.strokeStyle = stroke;
+      pen.beginPath();
+      points.forEach(([x, y]) => pen.lineTo(x, y));
+      pen.stroke();
+    };
+    pen.textAlign = "center";
+    for (const [value, label] of ticks(view.low[0], view.high[0])) {
+      line("#e6e6e6", [view.x(value), top], [view.x(value), bottom]);
+      pen.fillText(label, view.x(value), bottom + 18);
+    }
+    pen.textAlign = "right";
+    for (const [value, label] of ticks(view.low[1], view.high[1])) {
+      line("#e6e6e6", [left, view.y(value)], [right, view.y(value)]);
+      pen.fillText(label, left - 8, view.y(value) + 4);
+    }
+    line("#1d2129", [left, top], [left, bottom], [right, bottom]);
+    pen.textAlign = "center";
+    pen.fillText(data.axes[0], left + view.width / 2, bottom + 42);
+    pen.save();
+    pen.translate(15, top + view.height / 2);
+    pen.rotate(-Math.PI / 2);
+    pen.fillText(data.axes[1], 0, 0);
+    pen.restore();
+  }
+
+  function drawBackground() {
+    background = document.createElement("canvas");
+    [background.width, background.height] = [canvas.width, canvas.height];
+    const pen = background.getContext("2d");
+    pen.setTransform(view.ratio, 0, 0, view.ratio, 0, 0);
+    const points = shown().flatMap((e) => e.x.map((_, row) => [e, row]));
+    // In a mixed order, the same each time, no task hides the others where they overlap.
+    const stride = [7919, 7907, 7901].find((prime) => points.length % prime) || 1;
+    const radius = points.length > 2000 ? 2.2 : 3;
+    for (let i = 0; i < points.length; i += 1) {
+      const [episode, row] = points[(i * stride) % points.length];
+      dot(pen, episode, row, radius, color(episode, row));
+    }
+  }
+
+  function dot(pen, episode, row, radius, fill, edge) {
+    pen.beginPath();
+    pen.arc(view.x(episode.x[row]), view.y(episode.y[row]), radius, 0, 2 * Math.PI);
+    pen.fillStyle = fill;
+    pen.fill();
+    if (!edge) return;
+    pen.strokeStyle = edge;
+    pen.lineWidth = 2;
+    pen.stroke();
+  }
+
+  function line(episode, first, last, stroke, width) {
+    context.beginPath();
+    for (let row = first; row <= last; row += 1) {
+      context.lineTo(view.x(episode.x[row]), view.y(episode.y[row]));
+    }
+    context.strokeStyle = stroke;
+    context.lineWidth = width;
+    context.stroke();
+  }
+
+  function draw() {
+    context.setTransform(1, 0, 0, 1, 0, 0);
+    context.clearRect(0, 0, canvas.width, canvas.height);
+    context.setTransform(view.ratio, 0, 0, view.ratio, 0, 0);
+    drawAxes(context);
+    context.setTransform(1, 0, 0, 1, 0, 0);
+    context.globalAlpha = 0.5; // so that the chosen episode stands out
+    context.drawImage(background, 0, 0);
+    context.globalAlpha = 1;
+    context.setTransform(view.ratio, 0, 0, view.ratio, 0, 0);
+    const chosen = data.episodes[state.episode];
+    chosen.x.forEach((_, row) => dot(context, chosen, row, 3, color(chosen, row)));
+    // The whole way faintly, for it may be a tangle; its last half second clearly.
+    line(chosen, 0, chosen.x.length - 1, "rgba(29, 33, 41, 0.3)", 0.8);
+    line(chosen, Math.max(0, state.row - 10), state.row, "#1d2129", 2);
+    dot(context, chosen, state.row, 7, color(chosen, state.row), "#000");
+    if (!state.hovered) return;
+    const [episode, row] = state.hovered;
+    dot(context, data.episodes[episode], row, 6, "#fff", "#000");
+  }
+
+  function drawLegend() {
+    const legend = part("legend");
+    legend.replaceChildren();
+    const entry = (text, background, shape = "swatch") => {
+      const [item, mark] = [document.createElement("li"), document.createElement("span")];
+      mark.className = shape;
+      mark.style.background = background;
+      item.append(mark, text);
+      legend.append(item);
+    };
+    const coloring = part("coloring").value;
+    if (coloring === "distance") {
+      const ramp = `linear-gradient(90deg, ${VIRIDIS.join(", ")})`;
+      entry(`distance to goal: 0 to ${farthest.toFixed(2)} m`, ramp, "ramp");
+      return;
+    }
+    const kinds = coloring === "phase" ? data.phases : data.tasks;
+    const present = new Set(shown().flatMap((e) => (coloring === "phase" ? e.phase : e.task)));
+    kinds.forEach((kind, i) => present.has(i) && entry(kind.name, kind.color));
+  }
+
+  // -- details --------------------------------------------------------------------------------
+
+  function describe() {
+    const [index, row] = state.hovered || [state.episode, state.row];
+    const episode = data.episodes[index];
+    const task = data.tasks[episode.task].name;
+    const time = `${seconds(episode, row).toFixed(2)} s`;
+    const say = (name, text) => { part(`show-${name}`).textContent = text; };
+    say("task", task);
+    say("episode", `${episode.number} of ${episode.of}`);
+    say("time", `${time} (step ${episode.step[row]})`);
+    say("phase", data.phases[episode.phase[row]].name);
+    say("distance", `${episode.distance[row].toFixed(3)} m`);
+    say("success", episode.success[row] ? "yes" : "no");
+    const signed = (value) => value.toPrecision(3).replace("-", "−");
+    say("point", `(${signed(episode.x[row])}, ${signed(episode.y[row])})`);
+    part("which").textContent = state.hovered ? "Under the pointer" : "Chosen point";
+
+    const frame = frameAt(episode, row);
+    const picture = part("frame");
+    picture.hidden = !frame;
+    part("noframe").hidden = Boolean(frame);
+    if (frame) {
+      const source = `data:image/webp;base64,${frame[1]}`;
+      if (picture.src !== source) picture.src = source;
+      picture.alt = `${task}, episode ${episode.number}, at ${(frame[0] * data.period).toFixed(2)} s`;
+    } else {
+      part("noframe").textContent = data.note || "No pictures were made of this episode.";
+    }
+
+    const chosen = data.episodes[state.episode];
+    const clock = `${seconds(chosen, state.row).toFixed(2)} s`;
+    slider.value = state.row;
+    slider.setAttribute("aria-valuetext", `${clock}, ${chosen.distance[state.row].toFixed(3)} m`);
+    part("clock").textContent = clock;
+    part("play").textContent = state.playing ? "Pause" : "Play";
+  }
+
+  function refresh() {
+    draw();
+    describe();
+  }
+
+  function redraw() {
+    fit();
+    drawBackground();
+    drawLegend();
+    refresh();
+  }
+
+  // -- choosing -------------------------------------------------------------------------------
+
+  function option(text, value) {
+    const element = document.createElement("option");
+    element.textContent = text;
+    element.value = value;
+    return element;
+  }
+
+  function listEpisodes() {
+    const options = data.episodes.flatMap((e, i) => {
+      if (state.task >= 0 && e.task !== state.task) return [];
+      const film = hasFrames(e) ? " (film)" : "";
+      return [option(`${data.tasks[e.task].name} ${e.number}${film}`, i)];
+    });
+    part("episode").replaceChildren(...options);
+  }
+
+  function choose(episode, row) {
+    state.episode = episode;
+    state.row = row;
+    slider.max = data.episodes[episode].x.length - 1;
+    part("episode").value = episode;
+    refresh();
+  }
+
+  function chooseTask(task) {
+    stop();
+    state.task = task;
+    state.hovered = null;
+    listEpisodes();
+    const candidates = shown();
+    const first = candidates.find(hasFrames) || candidates[0];
+    fit();
+    drawBackground();
+    drawLegend();
+    choose(data.episodes.indexOf(first), 0);
+  }
+
+  function nearest(event) {
+    const box = canvas.getBoundingClientRect();
+    const [x, y] = [event.clientX - box.left, event.clientY - box.top];
+    let found = null;
+    let best = REACH ** 2;
+    data.episodes.forEach((episode, index) => {
+      if (state.task >= 0 && episode.task !== state.task) return;
+      for (let row = 0; row < episode.x.length; row += 1) {
+        const away = (view.x(episode.x[row]) - x) ** 2 + (view.y(episode.y[row]) - y) ** 2;
+        if (away < best) [best, found] = [away, [index, row]];
+      }
+    });
+    return found;
+  }
+
+  // -- playing --------------------------------------------------------------------------------
+
+  function stop() {
+    state.playing = false;
+  }
+
+  function play() {
+    const episode = data.episodes[state.episode];
+    const last = episode.x.length - 1;
+    if (state.row === last) state.row = 0;
+    state.playing = true;
+    state.hovered = null;
+    const begun = performance.now() / 1000 - seconds(episode, state.row);
+    const advance = () => {
+      if (!state.playing) return;
+      const now = performance.now() / 1000 - begun; // as fast as the robot moved
+      while (state.row < last && seconds(episode, state.row + 1) <= now) state.row += 1;
+      if (state.row === last) stop();
+      refresh();
+      requestAnimationFrame(advance);
+    };
+    advance();
+  }
+
+  part("play").addEventListener("click", () => {
+    if (state.playing) stop();
+    else play();
+    refresh();
+  });
+  slider.addEventListener("input", () => {
+    stop();
+    choose(state.episode, Number(slider.value));
+  });
+  part("task").addEventListener("change", (event) => chooseTask(Number(event.target.value)));
+  part("episode").addEventListener("change", (event) => {
+    stop();
+    choose(Number(event.target.value), 0);
+  });
+  part("coloring").addEventListener("change", redraw);
+  canvas.addEventListener("mousemove", (event) => {
+    state.hovered = nearest(event);
+    canvas.style.cursor = state.hovered ? "pointer" : "default";
+    refresh();
+  });
+  canvas.addEventListener("mouseleave", () => {
+    state.hovered = null;
+    refresh();
+  });
+  canvas.addEventListener("click", (event) => {
+    const found = nearest(event);
+    if (!found) return;
+    stop();
+    choose(...found);
+  });
+
+  part("task").append(option("All tasks", -1));
+  data.tasks.forEach((task, i) => {
+    if (data.episodes.some((e) => e.task === i)) part("task").append(option(task.name, i));
+  });
+  canvas.setAttribute("aria-label", data.description);
+  chooseTask(-1);
+  new ResizeObserver(redraw).observe(canvas);
+})();

@@ -1,0 +1,85 @@
+"""Studies of a finished run: each keeps its tables and figures, and the page shows them all."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.files import write_atomic
+from torchrl_bmrl.reports.page import Picture, Section
+from torchrl_bmrl.reports.tables import Table
+
+
+def write_study(
+    run_dir: str | os.PathLike[str], name: str, section: Section, figures: Mapping[str, Picture]
+) -> None:
+    """Keeps a study's part of the page in a run folder.
+
+    Written are ``tables/<name>.{md,csv}``, ``figures/<figure>.png`` and, last,
+    ``studies/<name>.json``, which the report reads; each atomically.
+
+    Args:
+        run_dir: The run folder.
+        name: Of the study; the name of its files.
+        section: Heading, text and one table.
+        figures: Pictures by the name of their file.
+
+    Example:
+        >>> import tempfile
+        >>> table = Table(title="T", caption="C", header=("a",), rows=[("1",)])
+        >>> folder = tempfile.mkdtemp()
+        >>> write_study(folder, "noise", Section(heading="Noise", tables=[table]), {})
+        >>> [section.heading for section in read_studies(folder)]
+        ['Noise']
+    """
+    run_dir = Path(run_dir)
+    (table,) = section.tables
+    write_atomic(run_dir / "tables" / f"{name}.md", table.markdown())
+    write_atomic(run_dir / "tables" / f"{name}.csv", table.csv())
+    for figure, picture in figures.items():
+        write_atomic(run_dir / "figures" / f"{figure}.png", picture.png)
+    content = {
+        "heading": section.heading,
+        "paragraphs": list(section.paragraphs),
+        "table": asdict(table),
+        "pictures": [
+            {"file": f"{figure}.png", "alt": picture.alt, "caption": picture.caption}
+            for figure, picture in figures.items()
+        ],
+    }
+    write_atomic(run_dir / "studies" / f"{name}.json", json.dumps(content, indent=1) + "\n")
+
+
+def read_studies(run_dir: str | os.PathLike[str]) -> list[Section]:
+    """The sections of the studies in a run folder, by name.
+
+    Raises:
+        DataError: if a file is not a study's, or one of its figures is missing.
+    """
+    return [_read(path) for path in sorted(Path(run_dir).glob("studies/*.json"))]
+
+
+def _read(path: Path) -> Section:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        pictures = [
+            Picture(
+                # The name alone: a file of a stranger's cannot lead out of the folder.
+                png=(path.parents[1] / "figures" / Path(picture["file"]).name).read_bytes(),
+                alt=picture["alt"],
+                caption=picture["caption"],
+            )
+            for picture in content["pictures"]
+        ]
+        return Section(
+            heading=content["heading"],
+            paragraphs=content["paragraphs"],
+            tables=[Table(**content["table"])],
+            pictures=pictures,
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(path, None, f"not the results of a study ({error}); remove it") from error
