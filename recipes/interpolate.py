@@ -50,12 +50,13 @@ from torchrl_bmrl.evaluation.behaviour import (
 )
 from torchrl_bmrl.evaluation.paths import data_path, straight_path, switched_path
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
-from torchrl_bmrl.files import write_atomic, write_rows
+from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.modules import BCQPolicy, PathTaskLatent
 from torchrl_bmrl.names import HORIZON, TASKS
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
+from torchrl_bmrl.reports import Picture, Section, Table, write_study
 from torchrl_bmrl.reports.figures import behaviour_trajectories, embedding_paths
-from torchrl_bmrl.reports.tables import MISSING, Table
+from torchrl_bmrl.reports.tables import MISSING
 
 METHODS = {
     "prototype": "Nothing: the task's prototype",
@@ -441,27 +442,41 @@ def switching_table(played: Mapping[str, dict[str, np.ndarray]]) -> Table:
     )  # fmt: skip
 
 
-def draw(config: Config, played: Mapping[str, dict[str, np.ndarray]], target: Path) -> None:
-    """The two figures."""
+def draw(config: Config, played: Mapping[str, dict[str, np.ndarray]]) -> dict[str, Picture]:
+    """The two figures by the name of their file."""
     shown = ["prototype", "tasks", "straight", "straight_noise", "curve", "random"]
-    write_atomic(
-        target / "interpolation_trajectories.png",
-        behaviour_trajectories(
-            {name.replace("_", " "): moved(played[name], "eef") for name in shown},
-            {name.replace("_", " "): played[name]["along"] for name in shown},
-        ),
+    trajectories = behaviour_trajectories(
+        {name.replace("_", " "): moved(played[name], "eef") for name in shown},
+        {name.replace("_", " "): played[name]["along"] for name in shown},
     )
     student, _ = load_student(Path(config.run_dir) / "distill" / "checkpoint.safetensors")
     parts = [training_embeddings(config, student, task, 500) for task in config.tasks]
     position = np.repeat([TASKS.index(task) for task in config.tasks], [len(x) for x in parts])
     paths = {kind: make_paths(config, student, kind, 200) for kind in ("straight", "curve")}
-    picture = embedding_paths(
+    drawn = embedding_paths(
         np.concatenate(parts),
         position,
         paths,
         embedding_points(config, student, "random")[0][:, 0],
     )
-    write_atomic(target / "interpolation_paths.png", picture)
+    return {
+        "interpolation_trajectories": Picture(
+            png=trajectories,
+            alt="Ways of the end-effector, one panel per method",
+            caption=(
+                "Ways of the end-effector from its start, seen from above and from the side; the "
+                "colour says where on its path between two tasks an episode's m lies."
+            ),
+        ),
+        "interpolation_paths": Picture(
+            png=drawn,
+            alt="Embeddings by task, with lines and curves between the tasks' prototypes",
+            caption=(
+                "Where the episodes' m lie: straight lines, curves over the training transitions, "
+                "and random points of the embedding."
+            ),
+        ),
+    }
 
 
 def interpolate(config: Config) -> None:
@@ -490,16 +505,15 @@ def interpolate(config: Config) -> None:
     played = {
         path.stem: read_episodes(path) for name in names for path in job_files((config, name))
     }
-    tables = {"interpolation": method_table(config, played)}
+    table = method_table(config, played)
+    section = Section(heading="Interpolation as exploration", tables=[table])
+    write_study(run_dir, "interpolation", section, draw(config, played))
+    print(table.markdown())
     if switching:
         ways = {name: read_episodes(folder(config) / f"{name}.csv") for name in SWITCHES}
-        tables["switching"] = switching_table(ways)
-    for name, table in tables.items():
-        write_atomic(run_dir / "tables" / f"{name}.md", table.markdown())
-        write_atomic(run_dir / "tables" / f"{name}.csv", table.csv())
+        table = switching_table(ways)
+        write_study(run_dir, "switching", Section(heading="Switching", tables=[table]), {})
         print(table.markdown())
-    draw(config, played, run_dir / "figures")
-    print(f"{run_dir / 'figures'}: interpolation_trajectories.png, interpolation_paths.png")
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="recipe")

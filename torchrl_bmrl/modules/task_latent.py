@@ -214,7 +214,7 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
         encoder: TensorDictModule,
         *,
         alignment: str = "time",
-        window: int = 5,
+        window: int = 20,
     ) -> None:
         if alignment not in ALIGNMENTS:
             raise UnknownNameError("alignment", alignment, ALIGNMENTS)
