@@ -132,6 +132,20 @@ class InterpolationSettings:
 
 
 @dataclass
+class LatentSACSettings:
+    """SAC on top of the distilled policy, beside SAC alone (latent_sac.py)."""
+
+    composition: str = "reach-lift"
+    hold: int = 20  # steps of the environment that a chosen m is held
+    num_candidates: int = 20  # of the frozen policy, which acts at every step
+    environment_steps: int = 20_000  # of each agent
+    random_steps: int = 1_000  # the first of these, without updates
+    seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
+    eval_interval: int = 2_000  # steps of the environment
+    eval_episodes: int = 10
+
+
+@dataclass
 class Config:
     """Everything that decides a run; ``config.yaml`` in the run folder is one of these."""
 
@@ -153,6 +167,7 @@ class Config:
     human: HumanSettings = field(default_factory=HumanSettings)
     imitate: ImitateSettings = field(default_factory=ImitateSettings)
     interpolation: InterpolationSettings = field(default_factory=InterpolationSettings)
+    latent_sac: LatentSACSettings = field(default_factory=LatentSACSettings)
 
 
 POSITIVE = (
@@ -180,6 +195,11 @@ POSITIVE = (
     "imitate.episodes",
     "imitate.cloning_updates",
     "interpolation.episodes",
+    "latent_sac.hold",
+    "latent_sac.num_candidates",
+    "latent_sac.environment_steps",
+    "latent_sac.eval_interval",
+    "latent_sac.eval_episodes",
 )
 CHOICES = {
     "logger": LOGGERS,
@@ -250,6 +270,12 @@ def check_settings(config: Config) -> None:
     shares = config.human.shares
     if 0 not in shares or len(set(shares)) < len(shares) or not all(0 <= x <= 1 for x in shares):
         raise ConfigError(f"human.shares is {shares}; valid: 0 and others up to 1, each once")
+    composition_stages(config.latent_sac.composition)
+    seeds, steps = config.latent_sac.seeds, config.latent_sac.random_steps
+    if not seeds or len(set(seeds)) < len(seeds):
+        raise ConfigError(f"latent_sac.seeds is {seeds}; valid: at least one, each once")
+    if not 0 <= steps <= config.latent_sac.environment_steps:
+        raise ConfigError(f"latent_sac.random_steps is {steps}; valid: 0 to environment_steps")
     if config.collect.valid_episodes < 1 or min(config.collect.train_episodes.values()) < 1:
         raise ConfigError("collect.train_episodes and collect.valid_episodes; valid: at least 1")
 

@@ -15,6 +15,7 @@ pytest.importorskip("h5py")
 
 import h5py
 
+from torchrl_bmrl import names
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import open_episodes, read_kept_episode
 from torchrl_bmrl.data.schema import OBSERVATION_SHAPES
@@ -35,14 +36,14 @@ class Killed(BaseException):
 
 @pytest.fixture(autouse=True)
 def _short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collect, "HORIZON", HORIZON)
+    monkeypatch.setattr(names, "HORIZON", HORIZON)
 
 
 @pytest.fixture(scope="module")
 def collected(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Path]]:
     """A collection by one worker."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(collect, "HORIZON", HORIZON)
+        patch.setattr(names, "HORIZON", HORIZON)
         yield run(tmp_path_factory.mktemp("collected"))
 
 

@@ -16,6 +16,7 @@ pytest.importorskip("h5py")
 
 import h5py
 
+from torchrl_bmrl import names
 from torchrl_bmrl.data.schema import OBSERVATION_SHAPES
 from torchrl_bmrl.experts import collect
 
@@ -59,7 +60,7 @@ print("read")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("played")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(collect, "HORIZON", 4)
+        patch.setattr(names, "HORIZON", 4)
         return collect.collect_demonstrations(
             folder, {"lift": 2}, valid_episodes=1, noise=0.2, seed=5, workers=1
         )["lift"]

@@ -147,6 +147,10 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
         ("interpolation.episodes=0", "interpolation.episodes is 0"),
         ("interpolation.task=lfit", "unknown task 'lfit'"),
         ("checkpoint_interval=0", "checkpoint_interval is 0"),
+        ("latent_sac.composition=reach-lfit", "unknown task 'lfit'"),
+        ("latent_sac.hold=0", "latent_sac.hold is 0"),
+        ("latent_sac.seeds=[1,1]", r"latent_sac.seeds is \[1, 1\]; valid: at least one, each once"),
+        ("latent_sac.random_steps=-1", "latent_sac.random_steps is -1; valid: 0 to"),
     ],
 )
 def test_every_stage_is_checked_before_the_first_one_starts(
@@ -955,3 +959,93 @@ def test_an_outcome_counts_as_neither_when_no_end_of_the_path_has_it(recipes: An
     between = [("push_up", lift), ("push_up", up), ("push_up", still), ("reach", up)]
     share = interpolate.share_of_neither(config, episodes(*between), tasks)
     assert share == "50%"
+
+
+# -- learning on top -------------------------------------------------------------------------------
+
+SAC = (
+    "latent_sac.hold=5",
+    "latent_sac.environment_steps=250",
+    "latent_sac.random_steps=100",
+    "latent_sac.eval_interval=200",
+    "latent_sac.eval_episodes=2",
+    "latent_sac.num_candidates=3",
+)
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_sac_learns_on_top_of_a_finished_run_and_keeps_every_agent(
+    run: Run, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    import latent_sac
+
+    folder = shutil.copytree(finished, tmp_path / "run")
+    before = times(folder)
+    run(folder, latent_sac.latent_sac, *SAC, "latent_sac.seeds=[4]")
+    kept = folder / "latent_sac" / "reach-lift-hold5"
+    with (kept / "results.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    # Chunks of 20 steps in five environments; evaluated before, from 200 on and at the end.
+    assert [(row["variant"], row["environment_steps"]) for row in rows] == [
+        ("latent", "0"),
+        ("latent", "200"),
+        ("latent", "300"),
+        ("raw", "0"),
+        ("raw", "200"),
+        ("raw", "300"),
+    ]
+    assert all(0 <= float(row["success"]) <= 1 and 0 <= float(row["stages"]) <= 2 for row in rows)
+    table = (folder / "tables" / "latent_sac-reach-lift-hold5.md").read_text()
+    assert "| latent | 4 | not within 250 |" in table
+    assert (folder / "figures" / "latent_sac-reach-lift-hold5.png").read_bytes()[1:4] == b"PNG"
+    assert before.items() <= times(folder).items()  # the run itself is as it was
+
+    agents = contents(kept, "*-seed4.csv")
+    written = {path: path.stat().st_mtime_ns for path in kept.glob("*-seed4.csv")}
+    run(folder, latent_sac.latent_sac, *SAC, "latent_sac.seeds=[4,5]")
+    assert {path: path.stat().st_mtime_ns for path in written} == written
+    assert len(contents(kept, "*-seed*.csv")) == 2 * len(agents) == 4
+    capsys.readouterr()
+    with pytest.raises(SystemExit):
+        run(folder, latent_sac.latent_sac, *SAC, "latent_sac.eval_episodes=3")
+    assert "eval_episodes is 3 here and 2 in the folder's run" in capsys.readouterr().err
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_one_seed_learns_the_same_twice(run: Run, finished: Path, tmp_path: Path) -> None:
+    import latent_sac
+
+    rows = []
+    for name in ("a", "b"):
+        shutil.copytree(finished / "data", tmp_path / name / "data")
+        shutil.copytree(finished / "distill", tmp_path / name / "distill")
+        config = OmegaConf.to_object(configured(*SMALL, *SAC, f"run_dir={tmp_path / name}"))
+        latent_sac.train_job((config, "latent", 0), lambda count: None)
+        rows.append(contents(tmp_path / name, "latent_sac/*/*.csv"))
+    assert rows[0] == rows[1] != {}
+
+
+def test_steps_to_half_are_those_of_the_first_evaluation_that_reaches_it(recipes: Any) -> None:
+    import latent_sac
+
+    def agent(*successes: float) -> list[dict[str, Any]]:
+        return [
+            {
+                "variant": "latent",
+                "seed": 3,
+                "environment_steps": 100 * i,
+                "success": success,
+                "stages": 2 * success,
+            }
+            for i, success in enumerate(successes)
+        ]
+
+    assert latent_sac.steps_to_half(agent(0.0, 0.4, 0.5, 0.3, 0.9)) == 200
+    assert latent_sac.steps_to_half(agent(0.0, 0.4)) is None
+    config = OmegaConf.to_object(configured("preset=smoke", "run_dir=run"))
+    table = latent_sac.make_table(config, [agent(0.0, 0.6, 0.2), agent(0.1, 0.4)])
+    assert table.rows[0] == ("latent", "3", "100", "0%", "60%", "20%", "0.4")
+    assert table.rows[1][2] == "not within 20,000"

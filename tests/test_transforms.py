@@ -18,6 +18,7 @@ from torchrl_bmrl.envs.transforms import (
     ObservationStatistics,
     PerturbAction,
     SinCosTransform,
+    StageReward,
     make_observation_transform,
     tilt,
     transform_data,
@@ -300,3 +301,36 @@ def test_the_data_keep_the_policys_action_and_the_simulator_gets_the_perturbed_o
         heights.append(float(data["next", "observation"][-1, 25] - data["observation"][0, 25]))
         env.close()
     assert 0 < heights[1] < 0.7 * heights[0]
+
+
+# -- sparse reward ---------------------------------------------------------------------------------
+
+
+def test_stages_are_paid_once_each_and_the_agent_knows_how_many_are_done() -> None:
+    transform = StageReward(4)
+    stages = [torch.tensor([0, 2]), torch.tensor([0, 3]), torch.tensor([2, 3])]
+    shown = [TensorDict({"stage": stage}, [2]) for stage in stages]
+    now = transform._reset(None, shown[0])
+    assert now["progress"].flatten().tolist() == [0, 0.5]
+    rewards = []
+    for after in shown[1:]:
+        now = transform._step(now, after.set("reward", torch.rand(2, 1)))  # the dense one goes
+        rewards.append(now["reward"].flatten().tolist())
+    assert rewards == [[0, 1], [2, 0]]
+    assert now["progress"].flatten().tolist() == [0.5, 0.75]
+    with pytest.raises(BMRLError, match="num_stages is 0"):
+        StageReward(0)
+
+
+@pytest.mark.robosuite
+def test_a_composition_with_sparse_reward_keeps_its_specs() -> None:
+    from torchrl.envs import check_env_specs
+
+    from torchrl_bmrl.envs.transforms import make_env
+
+    env = make_env("reach-lift", None, StageReward(2), num_envs=2)
+    check_env_specs(env)
+    data = env.rollout(2)
+    assert data["next", "reward"].tolist() == [[[0], [0]]] * 2
+    assert data["progress"].shape == (2, 2, 1)
+    env.close()

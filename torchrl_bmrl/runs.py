@@ -17,7 +17,15 @@ from torchrl_bmrl import __version__
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
 from torchrl_bmrl.files import write_atomic
 
-FREE_TO_CHANGE = ("run_dir", "workers", "stepper", "logger", "imitate", "interpolation")
+FREE_TO_CHANGE = (
+    "run_dir",
+    "workers",
+    "stepper",
+    "logger",
+    "imitate",
+    "interpolation",
+    "latent_sac",
+)
 """Settings that do not change a run's result, and so may differ when it goes on.
 
 Studies of a finished run are among them; each is held to its own settings by its own folder.

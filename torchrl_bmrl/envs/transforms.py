@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import GymEnv, GymWrapper, TransformedEnv
 from torchrl.envs.gym_like import default_info_dict_reader
 from torchrl.envs.transforms import (
@@ -166,6 +166,56 @@ def tilt(vector: Tensor, towards: Tensor, angle: Tensor) -> Tensor:
     across = towards - (towards * unit).sum(-1, keepdim=True) * unit
     across = across / across.norm(dim=-1, keepdim=True).clamp_min(1e-12)
     return length * (angle.cos() * unit + angle.sin() * across)
+
+
+class StageReward(Transform):
+    """Rewards what a composition has done, and nothing else: +1 for each stage completed.
+
+    Reads ``stage (*B,)`` before and after a step. Writes ``("next", "reward") (*B, 1)`` and, so
+    that an agent knows what is left to do, ``progress (*B, 1)``: the share of stages done.
+
+    Args:
+        num_stages: tasks of the composition.
+
+    Raises:
+        BMRLError: for fewer than one.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> transform = StageReward(2)
+        >>> now, after = (TensorDict({"stage": torch.tensor(i)}) for i in (0, 1))
+        >>> after = transform._step(now, after)
+        >>> after["reward"], after["progress"]
+        (tensor([1.]), tensor([0.5000]))
+    """
+
+    def __init__(self, num_stages: int) -> None:
+        if num_stages < 1:
+            raise BMRLError(f"num_stages is {num_stages}; valid: at least 1")
+        super().__init__(in_keys=["stage"], out_keys=["progress"])
+        self.num_stages = num_stages
+
+    def _apply_transform(self, stage: Tensor) -> Tensor:
+        return stage.unsqueeze(-1).float() / self.num_stages
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        gained = next_tensordict.get("stage") - tensordict.get("stage")
+        return self._call(next_tensordict).set("reward", gained.unsqueeze(-1).float())
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def transform_reward_spec(self, reward_spec: Composite) -> Composite:
+        """Rewards are whole numbers of stages."""
+        reward_spec["reward"] = Bounded(0, self.num_stages, (*reward_spec.shape, 1))
+        return reward_spec
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Adds ``progress``."""
+        observation_spec["progress"] = Bounded(0, 1, (*observation_spec.shape, 1))
+        return observation_spec
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from torchrl_bmrl.modules.generator import (
     make_perturbation_network,
     make_qvalue_network,
 )
+from torchrl_bmrl.modules.latent_action import HeldTaskLatent, task_latent_box
 from torchrl_bmrl.modules.policy import (
     BCQPolicy,
     DiscreteBCQPolicy,
@@ -30,6 +31,7 @@ __all__ = [
     "BCQPolicy",
     "DemonstrationTaskLatent",
     "DiscreteBCQPolicy",
+    "HeldTaskLatent",
     "OnlineTaskLatent",
     "PLASPolicy",
     "PathTaskLatent",
@@ -44,4 +46,5 @@ __all__ = [
     "make_task_classifier",
     "make_task_encoder",
     "prototype",
+    "task_latent_box",
 ]

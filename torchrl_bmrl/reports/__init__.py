@@ -11,6 +11,7 @@ from torchrl_bmrl.reports.figures import (
     embedding_tsne,
     reach_trajectories,
     stage1_curves,
+    success_curves,
 )
 from torchrl_bmrl.reports.page import Picture, Section, write_page
 from torchrl_bmrl.reports.report import read_stage1_curves, write_report
@@ -44,6 +45,7 @@ __all__ = [
     "results_table",
     "stage1_curves",
     "stages_table",
+    "success_curves",
     "table_1",
     "table_2",
     "task_name",

@@ -259,6 +259,41 @@ def reach_trajectories(
     return _png(figure)
 
 
+def success_curves(curves: Mapping[str, Sequence[NDArray[Any]]], *, title: str) -> bytes:
+    """Success over the environment's steps: each seed thin, the mean over seeds thick.
+
+    Args:
+        curves: by name, one array ``(E, 2)`` for each seed: steps of the environment when it was
+            evaluated, and the success rate then.
+        title: of the figure.
+
+    Returns:
+        PNG image.
+
+    Example:
+        >>> curve = np.array([[0, 0.0], [1000, 0.5], [2000, 1.0]])
+        >>> success_curves({"latent": [curve, curve / 2], "raw": [0 * curve]}, title="T")[1:4]
+        b'PNG'
+    """
+    figure = Figure(figsize=(6.2, 3.8), layout="constrained")
+    axes = figure.subplots()
+    _tidy(axes)
+    for (name, seeds), color in zip(curves.items(), _OKABE_ITO, strict=False):
+        for curve in seeds:
+            axes.plot(*np.asarray(curve).T, color=color, linewidth=0.8, alpha=0.5)
+        # Seeds are evaluated at about the same steps; the mean is taken at all of them.
+        steps = np.unique(np.concatenate([np.asarray(curve)[:, 0] for curve in seeds]))
+        mean = np.mean([np.interp(steps, *np.asarray(curve).T) for curve in seeds], axis=0)
+        axes.plot(steps, mean, color=color, linewidth=2.2, label=f"{name}, mean of {len(seeds)}")
+    axes.axhline(0.5, color=_GREY, linestyle="--", linewidth=0.8)
+    axes.set_ylim(-0.03, 1.03)
+    axes.set_xlabel("Steps of the environment")
+    axes.set_ylabel("Success rate")
+    axes.set_title(title, fontsize=11)
+    figure.legend(loc="outside lower center", ncols=len(curves), frameon=False, fontsize=9)
+    return _png(figure)
+
+
 def _level_sets(
     points: NDArray[np.float64], center: NDArray[np.float64], distance: NDArray[np.floating[Any]]
 ) -> list[tuple[float, float]]:
