@@ -57,7 +57,9 @@ def test_an_expert_solves_its_task_phase_by_phase_within_the_action_space(
     assert solved
     assert actions.shape[1] == 7
     assert np.abs(actions).max() <= 1.0
-    assert make_expert(task, envs[task].robosuite_env).phases == PHASES[task]
+    names = make_expert(task, envs[task].robosuite_env).phases
+    # Beyond these a push can let go of a cube that it finds in the hand.
+    assert names[: len(PHASES[task])] == PHASES[task]
     # Without noise nothing is dropped or slips away: every phase once, in order.
     assert list(dict.fromkeys(phases)) == list(range(len(PHASES[task])))
     assert (np.diff(phases) >= 0).all()
@@ -116,7 +118,7 @@ def test_an_expert_starts_over_after_reset(envs: dict[str, SawyerEnv], task: str
 
 
 def test_a_seed_reproduces_an_episode_with_its_noise(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchrl_bmrl.experts.collect.HORIZON", 25)
+    monkeypatch.setattr("torchrl_bmrl.names.HORIZON", 25)
     gains = ExpertGains()
     first = collect_episode("lift", 5, noise=0.3, gains=gains)
     other = collect_episode("lift", 6, noise=0.3, gains=gains)
@@ -133,7 +135,7 @@ def test_a_seed_reproduces_an_episode_with_its_noise(monkeypatch: pytest.MonkeyP
 def test_noise_is_gaussian_of_the_size_asked_for_on_every_dimension(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("torchrl_bmrl.experts.collect.HORIZON", 60)
+    monkeypatch.setattr("torchrl_bmrl.names.HORIZON", 60)
     # Slow, so that clipping to [-1, 1] leaves the noise as it was drawn.
     gains = ExpertGains(speed_limit=0.05)
     noisy = collect_episode("reach", 0, noise=0.2, gains=gains)

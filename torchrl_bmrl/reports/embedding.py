@@ -124,16 +124,15 @@ class Embeddings:
 def name_stages(
     training: Embeddings, held_out: Embeddings, task: str, *, seed: int = 0
 ) -> dict[str, NDArray[np.int64]]:
-    """Groups of a task's held-out transitions on the way, as many as it has phases.
+    """Groups of a task's held-out transitions on the way, as many as phases occur in training.
 
     Returns:
         By representation, a group for each row of ``held_out.on_the_way(task, tail=STAGE_TAIL)``.
     """
     train, test = (x.on_the_way(task, tail=STAGE_TAIL) for x in (training, held_out))
+    count = len(np.unique(train.phase))
     return {
-        name: find_stages(
-            train.representations[name], points, len(held_out.phase_names[task]), seed=seed
-        )
+        name: find_stages(train.representations[name], points, count, seed=seed)
         for name, points in test.representations.items()
     }
 
@@ -144,7 +143,7 @@ def measure_stages(
     """Groups each task's transitions without labels, and holds them against recorded phases.
 
     The groups are found in the training transitions and named on the held-out ones, for m and for
-    each baseline in the same way; there are as many as phases.
+    each baseline in the same way; there are as many as phases that occur in training.
 
     Args:
         training: Transitions that groups are found in.
@@ -155,8 +154,9 @@ def measure_stages(
         One result for each task with more than one phase and transitions of both kinds.
     """
     results = []
-    for task, phases in held_out.phase_names.items():
+    for task, names in held_out.phase_names.items():
         train, test = (x.on_the_way(task, tail=STAGE_TAIL) for x in (training, held_out))
+        phases = [names[number] for number in np.unique(train.phase)]
         if len(phases) < 2 or len(train.task) < len(phases) or not len(test.task):
             continue
         results.append(
