@@ -14,6 +14,7 @@ for extra in ("scipy", "sklearn"):
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.evaluation.embedding import (
+    STAGE_TAIL,
     distance_correlations,
     find_stages,
     mean_estimate,
@@ -216,3 +217,23 @@ def test_what_does_not_fit_is_refused_by_name() -> None:
         spread_ratio(points[:3], points[:2])
     with pytest.raises(BMRLError, match="start is one point 2 times"):
         spread_ratio(points[[0, 0]], points[:2])
+
+
+def test_stages_are_looked_for_in_successful_episodes_alone() -> None:
+    from torchrl_bmrl.names import TASKS
+    from torchrl_bmrl.reports import Embeddings
+
+    episode, step = (a.ravel() for a in np.meshgrid(range(3), range(40)))
+    zeros = np.zeros(episode.size, dtype=int)
+    embeddings = Embeddings(
+        task_latent=np.zeros((episode.size, 2)),
+        task=zeros + TASKS.index("lift"),
+        episode=episode,
+        step=step,
+        distance=zeros,
+        success=(step >= 20) & (episode != 1),
+    )
+    found = embeddings.in_stages("lift")
+    assert set(found.episode) == {0, 2}
+    assert found.step.max() == 20 + STAGE_TAIL
+    assert len(embeddings.in_stages("reach").task) == 0

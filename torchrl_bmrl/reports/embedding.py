@@ -115,6 +115,15 @@ class Embeddings:
             return own
         return own.rows(until_success(own.success, own.episode, own.step, tail=tail))
 
+    def in_stages(self, task: str) -> Embeddings:
+        """A task's transitions that stages are looked for in.
+
+        Those on the way of its successful episodes and :data:`STAGE_TAIL` steps more. In an episode
+        that fails its first stages go on to the end, two hundred steps beside forty.
+        """
+        way = self.on_the_way(task, tail=STAGE_TAIL)
+        return way.rows(np.isin(way.episode, way.episode[way.success]))
+
     @property
     def representations(self) -> dict[str, NDArray[Any]]:
         """The embedding and the baselines by name."""
@@ -127,9 +136,9 @@ def name_stages(
     """Groups of a task's held-out transitions on the way, as many as phases occur in training.
 
     Returns:
-        By representation, a group for each row of ``held_out.on_the_way(task, tail=STAGE_TAIL)``.
+        By representation, a group for each row of ``held_out.in_stages(task)``.
     """
-    train, test = (x.on_the_way(task, tail=STAGE_TAIL) for x in (training, held_out))
+    train, test = (x.in_stages(task) for x in (training, held_out))
     count = len(np.unique(train.phase))
     return {
         name: find_stages(train.representations[name], points, count, seed=seed)
@@ -155,7 +164,7 @@ def measure_stages(
     """
     results = []
     for task, names in held_out.phase_names.items():
-        train, test = (x.on_the_way(task, tail=STAGE_TAIL) for x in (training, held_out))
+        train, test = (x.in_stages(task) for x in (training, held_out))
         phases = [names[number] for number in np.unique(train.phase)]
         if len(phases) < 2 or len(train.task) < len(phases) or not len(test.task):
             continue

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from torchrl_bmrl.errors import DataError
-from torchrl_bmrl.evaluation.embedding import STAGE_TAIL
 from torchrl_bmrl.evaluation.results import Summary, read_results, summarise
 from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.names import TASKS
@@ -303,7 +302,7 @@ def _measure_embeddings(
         tables["goal_distance"] = goal_distance_table(distances)
     else:
         notes.append("The distances are left out: no training demonstration succeeds.")
-    way = embeddings.on_the_way("lift", tail=STAGE_TAIL)
+    way = embeddings.in_stages("lift")
     if "lift" not in [result.task for result in stages] or len(way.task) < 4:
         return tables, {}, notes
     picture = Picture(
@@ -316,9 +315,9 @@ def _measure_embeddings(
         ),
         alt="Two t-SNE maps of lift's embeddings: by recorded phase, and by group found",
         caption=(
-            "t-SNE of the embeddings of lift, held-out episodes until half a second after their "
-            "first success: by the phase that the expert recorded, and by the group found without "
-            "it. Compare the paper's figure 4b."
+            "t-SNE of the embeddings of lift, held-out episodes that succeed, until half a second "
+            "after their first success: by the phase that the expert recorded, and by the group "
+            "found without it. Compare the paper's figure 4b."
         ),
     )
     return tables, {"embedding_stages": picture}, notes
