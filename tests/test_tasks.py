@@ -134,9 +134,13 @@ def episode(env: SawyerEnv, seed: int, actions: np.ndarray) -> np.ndarray:
 # -- interfaces ------------------------------------------------------------------------------------
 
 
-def test_the_six_ids_are_those_of_the_tasks() -> None:
+def test_the_ids_are_those_of_the_tasks_and_one_for_compositions() -> None:
     assert {task: gymnasium_id(task) for task in TASKS} == IDS
-    assert set(IDS.values()) == {i for i in gymnasium.registry if i.startswith("bmrl/")}
+    registered = {i for i in gymnasium.registry if i.startswith("bmrl/")}
+    assert registered == {*IDS.values(), "bmrl/SawyerComposition-v0"}
+    env = gymnasium.make("bmrl/SawyerComposition-v0")
+    assert env.unwrapped.task == "reach-lift-reach"
+    env.close()
 
 
 @pytest.mark.filterwarnings("ignore:.*Box observation space m.*imum value is:UserWarning")
@@ -398,7 +402,8 @@ def test_rewards_are_those_of_the_equations(envs: dict[str, SawyerEnv], task: st
 def test_a_reset_gives_no_reward(envs: dict[str, SawyerEnv]) -> None:
     for env in envs.values():
         _, info = env.reset(seed=0)
-        assert info == {"success": False, **{f"reward_{name}": 0.0 for name in REWARD_TERMS}}
+        none = {f"reward_{name}": 0.0 for name in REWARD_TERMS}
+        assert info == {"success": False, "stage": 0, **none}
 
 
 # -- success ---------------------------------------------------------------------------------------

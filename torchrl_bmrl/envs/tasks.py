@@ -394,12 +394,13 @@ class _BMRLSawyerTask(ManipulationEnv):
         velocity = self.sim.data.qvel[self._cube_dof : self._cube_dof + 3]
         moved = float(np.linalg.norm(self.cube_displacement))
         return terms | {
-            "velocity": push_velocity_reward(velocity, self._push_direction),
+            "velocity": push_velocity_reward(velocity, self.direction),
             "distance": float(moved > PUSH_SUCCESS_DISTANCE),
         }
 
     @property
-    def _push_direction(self) -> np.ndarray:
+    def direction(self) -> np.ndarray:
+        """Unit vector (3,) that the push at hand is measured along."""
         return np.array(PUSH_DIRECTIONS[self.task.removeprefix("push_")])
 
     def task_success(self) -> bool:
@@ -408,8 +409,8 @@ class _BMRLSawyerTask(ManipulationEnv):
             return bool(np.linalg.norm(self.eef_position - self.goal) < REACH_SUCCESS_DISTANCE)
         if self.task == "lift":
             return bool(self.cube_displacement[2] > LIFT_SUCCESS_HEIGHT) and self.grasped
-        along = float(self.cube_displacement @ self._push_direction)
-        sideways = float(np.linalg.norm(self.cube_displacement - along * self._push_direction))
+        along = float(self.cube_displacement @ self.direction)
+        sideways = float(np.linalg.norm(self.cube_displacement - along * self.direction))
         return along > PUSH_SUCCESS_DISTANCE and sideways <= PUSH_SUCCESS_DISTANCE / 2
 
     def _check_success(self) -> bool:
