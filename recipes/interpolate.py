@@ -464,7 +464,7 @@ def draw(config: Config, played: Mapping[str, dict[str, np.ndarray]]) -> dict[st
             png=trajectories,
             alt="Ways of the end-effector, one panel per method",
             caption=(
-                "Ways of the end-effector from its start, seen from above and from the side; the "
+                "Ways of the end-effector from its start, seen from above and from behind; the "
                 "colour says where on its path between two tasks an episode's m lies."
             ),
         ),
