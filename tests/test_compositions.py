@@ -232,6 +232,9 @@ def test_a_demonstration_of_a_composition_knows_its_stages() -> None:
     assert stages[-1] == 3
     first = np.flatnonzero(chain.extras["successes"])[0]
     assert stages[first + 1] == 3 > stages[first]
+    # Phases of different experts have no names in common.
+    assert "phases" not in chain.extras
+    assert "phase_names" not in chain.attributes
 
 
 def test_the_starts_of_a_task_are_taken_in_turn(tmp_path: Any, monkeypatch: Any) -> None:

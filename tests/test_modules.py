@@ -581,6 +581,21 @@ def test_progress_follows_an_episode_that_repeats_the_demonstration(
             assert torch.equal(latent, latents[t])
 
 
+def test_progress_stays_where_it_is_when_an_episode_falls_back(
+    encoder: TensorDictModule,
+) -> None:
+    data = transitions(8, dtype=torch.float32)
+    latents = embedded(encoder, data)
+    transform = DemonstrationTaskLatent(data, encoder, alignment="progress")
+    transform._reset(None, data[0].exclude("next"))
+    positions = []
+    for t in (5, 1):
+        latent = transform._step(data[t], data[t]["next"].clone())["task_latent"]
+        positions.append(int((latents == latent).all(-1).nonzero()[0]))
+    nearest = (latents[5:] - latents[1]).norm(dim=-1).argmin()
+    assert positions == [5, 5 + int(nearest)]
+
+
 @pytest.mark.parametrize(
     ("rows", "options", "says"),
     [(0, {}, "0 transitions; valid: at least one"), (4, {"window": 0}, "window is 0; valid")],

@@ -128,14 +128,15 @@ def collect_episode(
         terminated=np.zeros(len(actions), dtype=bool),
         extras={
             "successes": np.array(successes),
-            "phases": np.array(phases, dtype=np.int8),
+            # A composition's experts differ in what their phases are: it has stages instead.
+            **({} if "-" in task else {"phases": np.array(phases, dtype=np.int8)}),
             "states": np.stack(states),
             **({"stages": np.array(stages, dtype=np.int8)} if "-" in task else {}),
         },
         # robomimic plays states back in the model of the demonstration.
         attributes={
             "seed": seed,
-            "phase_names": list(expert.phases),
+            **({} if "-" in task else {"phase_names": list(expert.phases)}),
             "model_file": model_file,
             **({"after": after} if after else {}),
         },
