@@ -97,6 +97,7 @@ def train_student(config: Config, report: Report) -> None:
     teachers = [BCQPolicy.from_loss(loss) for loss in losses]
     options = {
         "num_tasks": len(config.tasks),
+        "task_encoder": settings.task_encoder,
         "task_latent_dim": settings.task_latent_dim,
         "num_cells": settings.num_cells,
         "latent_dim": teachers[0].latent_dim,

@@ -2,6 +2,7 @@
 
 python recipes/evaluate.py run_dir=runs/mine            # after recipes/distill.py
 python recipes/evaluate.py run_dir=runs/mine "evaluate.latent_sources=[prototype,online]"
+python recipes/evaluate.py evaluate.policy=recipes/policies/sawyer.safetensors    # no run needed
 """
 
 from __future__ import annotations
@@ -12,14 +13,17 @@ os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import hydra
 import numpy as np
 import torch
 from omegaconf import DictConfig
 from settings import Config, run_recipe
+from tensordict import TensorDict, TensorDictBase
 
 from torchrl_bmrl.agents import Student, load_bcq_loss, load_student
+from torchrl_bmrl.checkpoint import load_checkpoint
 from torchrl_bmrl.data.demonstrations import (
     demonstration_path,
     load_transitions,
@@ -27,7 +31,8 @@ from torchrl_bmrl.data.demonstrations import (
     read_phases,
     read_statistics,
 )
-from torchrl_bmrl.envs.transforms import make_env
+from torchrl_bmrl.envs.transforms import ObservationStatistics, make_env
+from torchrl_bmrl.errors import UnknownNameError
 from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome, evaluate_policy
 from torchrl_bmrl.experts.collect import collect_episode
@@ -50,25 +55,22 @@ def evaluate_job(job: tuple[Config, str, str, str], report: Report) -> list[Resu
         report(episodes * HORIZON)
         return read_results(path)
     seeds = [derive_seed(config.seed, "evaluate", task, i) for i in range(episodes)]
-    statistics = read_statistics(run_dir / "data")
     if policy_name == "expert":
         outcomes = expert_outcomes(config, task, seeds)
         report(episodes * HORIZON)
     elif policy_name == "bcq":
-        loss, _ = load_bcq_loss(run_dir / "bcq" / task / "checkpoint.safetensors")
+        loss, metadata = load_bcq_loss(run_dir / "bcq" / task / "checkpoint.safetensors")
         policy = BCQPolicy.from_loss(loss, num_candidates=config.evaluate.num_candidates)
-        with closing(make_env(task, statistics, **options)) as env:
+        with closing(make_env(task, read_statistics(run_dir / "data"), **options)) as env:
             outcomes = evaluate_policy(env, policy, seeds, report=report)
     else:
-        student, metadata = load_student(run_dir / "distill" / "checkpoint.safetensors")
+        student, metadata = load_student(student_path(config))
         policy = student.policy(
             num_candidates=config.evaluate.num_candidates, latent_clip=metadata["latent_clip"]
         )
-        index = config.tasks.index(task)
-        held_out = load_transitions(
-            run_dir / "data", task, statistics, split="valid", num_task=index
-        )
-        demonstration = held_out[held_out["episode"] == 0]
+        statistics = ObservationStatistics.from_lists(metadata["statistics"])
+        index = metadata["tasks"].index(task)
+        demonstration = held_out_episode(config, task, index, statistics)
         transform = student.task_latent_source(source, index, demonstration)
         with closing(make_env(task, statistics, transform, **options)) as env:
             outcomes = evaluate_policy(env, policy, seeds, report=report)
@@ -86,6 +88,26 @@ def evaluate_job(job: tuple[Config, str, str, str], report: Report) -> list[Resu
     ]
     write_results(path, rows)
     return rows
+
+
+def student_path(config: Config) -> Path:
+    """The distilled policy to evaluate: the run's own, or a file that was shipped."""
+    if config.evaluate.policy:
+        return Path(config.evaluate.policy)
+    return Path(config.run_dir) / "distill" / "checkpoint.safetensors"
+
+
+def held_out_episode(
+    config: Config, task: str, index: int, statistics: ObservationStatistics
+) -> TensorDictBase:
+    """The demonstration that m may come from; a file of a policy brings its own."""
+    if config.evaluate.policy:
+        state, _ = load_checkpoint(student_path(config), kind="student")
+        return TensorDict(state["demonstrations"][task]).auto_batch_size_(1)
+    data = load_transitions(
+        Path(config.run_dir) / "data", task, statistics, split="valid", num_task=index
+    )
+    return data[data["episode"] == 0]
 
 
 def expert_outcomes(config: Config, task: str, seeds: list[int]) -> list[EpisodeOutcome]:
@@ -151,10 +173,27 @@ def embed(config: Config, split: str) -> tuple[Embeddings, float]:
     return embeddings, student.accuracy(data)
 
 
+def look_at_embedding(config: Config) -> dict[str, Any]:
+    """What the report shows of the embedding."""
+    embeddings, accuracy = embed(config, "valid")
+    return {
+        "embeddings": embeddings,
+        "training": embed(config, "train")[0],
+        "accuracy": accuracy,
+        "explorer": explore_demonstrations(Path(config.run_dir) / "data", embeddings),
+    }
+
+
 def evaluate(config: Config) -> None:
     """Evaluates every policy on every task, then writes ``results.csv`` and the report."""
     run_dir = Path(config.run_dir)
-    policies = [("expert", ""), ("bcq", "")]
+    alone = config.evaluate.policy is not None
+    if alone:
+        known = load_student(student_path(config))[1]["tasks"]
+        for task in config.tasks:
+            if task not in known:
+                raise UnknownNameError("task of the policy", task, known)
+    policies = [] if alone else [("expert", ""), ("bcq", "")]
     policies += [("distilled", source) for source in config.evaluate.latent_sources]
     jobs = [(config, task, *policy) for policy in policies for task in config.tasks]
     rows = run_jobs(
@@ -166,16 +205,13 @@ def evaluate(config: Config) -> None:
         unit="step",
     )
     write_results(run_dir / "results.csv", [row for part in rows for row in part])
-    embeddings, accuracy = embed(config, "valid")
+    look = not alone and config.distill.task_encoder == "transition"
     write_report(
         run_dir,
         default_source=config.evaluate.latent_sources[0],
         facts=run_facts(config),
-        embeddings=embeddings,
-        training=embed(config, "train")[0],
-        accuracy=accuracy,
-        explorer=explore_demonstrations(run_dir / "data", embeddings),
         seed=config.seed,
+        **(look_at_embedding(config) if look else {}),
     )
     print((run_dir / "tables" / "results.md").read_text())
     print(f"report: {run_dir / 'report.html'}")
@@ -184,6 +220,9 @@ def evaluate(config: Config) -> None:
 def run_facts(config: Config) -> dict[str, str]:
     """What the report says about the run."""
     versions = read_versions(Path(config.run_dir))
+    said = {"Versions": ", ".join(f"{name} {version}" for name, version in versions.items())}
+    if config.evaluate.policy:
+        return {"Policy": config.evaluate.policy, "Seed of the starts": str(config.seed)} | said
     demonstrations = ", ".join(
         f"{task} {config.collect.train_episodes[task]}" for task in config.tasks
     )
@@ -192,8 +231,7 @@ def run_facts(config: Config) -> dict[str, str]:
         "Demonstrations": f"{demonstrations}; {config.collect.valid_episodes} held out of each",
         "Stage 1": f"{config.bcq.epochs} epochs of {config.bcq.updates_per_epoch} updates",
         "Stage 2": f"{config.distill.updates} updates",
-        "Versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
-    }
+    } | said
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="recipe")

@@ -10,7 +10,7 @@ from pathlib import Path
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from torchrl_bmrl.agents import LATENT_SOURCES
+from torchrl_bmrl.agents import LATENT_SOURCES, TASK_ENCODERS
 from torchrl_bmrl.data.replay import check_device
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.experts.controllers import ExpertGains
@@ -74,6 +74,7 @@ class DistillSettings:
     lr: float = 1e-3
     cosine: bool = True  # decay of the learning rate to zero
     num_cells: list[int] = field(default_factory=lambda: [256, 256])
+    task_encoder: str = "transition"  # what m is made of; one_hot: of the task's index alone
     task_latent_dim: int = 2
     context: str = "set"  # what m is computed from: current (the paper's), previous, random, set
     context_fraction: float = 0.5
@@ -98,6 +99,7 @@ class EvaluateSettings:
     episodes: int = MISSING  # of each task and policy
     num_candidates: int = 100
     latent_sources: list[str] = field(default_factory=lambda: ["prototype"])
+    policy: str | None = None  # a shipped policy's file, evaluated alone
     expert_rollouts: bool = False  # False: the expert's rows are its demonstrations
 
 
@@ -149,8 +151,11 @@ class LatentSACSettings:
 class Config:
     """Everything that decides a run; ``config.yaml`` in the run folder is one of these."""
 
+    preset: str = "${hydra:runtime.choices.preset}"
+    ablation: str = "${hydra:runtime.choices.ablation}"
     seed: int = 0
-    run_dir: str = "runs/${hydra:job.name}-${hydra:runtime.choices.preset}-seed${seed}"
+    run_dir: str = "runs/${hydra:job.name}-${name:${preset},${ablation}}-seed${seed}"
+    base: str | None = None  # a run's folder: what this run would make again is taken from there
     tasks: list[str] = field(default_factory=lambda: list(TASKS))
     workers: int = field(default_factory=available_cores)  # processes; no result depends on them
     stepper: str = "fast"  # or robosuite, four times slower; no result depends on it
@@ -208,6 +213,7 @@ CHOICES = {
     "bcq.kl_reduction": KL_REDUCTIONS,
     "bcq.target_dtype": (None, *TARGET_DTYPES),
     "distill.context": CONTEXTS,
+    "distill.task_encoder": TASK_ENCODERS,
     "distill.prototype": ("mean", "medoid"),
 }
 
@@ -262,6 +268,14 @@ def check_settings(config: Config) -> None:
             f"imitate.episodes is {config.imitate.episodes}; valid: a multiple of "
             f"imitate.demonstrations ({config.imitate.demonstrations})"
         )
+    one_hot = config.distill.task_encoder == "one_hot"
+    if one_hot and (
+        config.evaluate.latent_sources != ["prototype"] or config.distill.isometry_weight
+    ):
+        raise ConfigError(
+            "distill.task_encoder is one_hot, which knows no transitions; valid with it: "
+            "evaluate.latent_sources=[prototype] and distill.isometry_weight=0"
+        )
     check_device(config.device)
     check_value_bounds(config.bcq.value_bounds)
     for term in config.distill.encoder_terms:
@@ -292,4 +306,7 @@ def run_recipe(settings: DictConfig, run: Callable[[Config], None]) -> None:
         sys.exit(1)
 
 
+OmegaConf.register_new_resolver(
+    "name", lambda preset, ablation: preset if ablation == "none" else f"{preset}-{ablation}"
+)
 ConfigStore.instance().store(name="schema", node=Config)

@@ -20,6 +20,7 @@ from torchrl_bmrl.modules import (
     OnlineTaskLatent,
     PrototypeTaskLatent,
     make_decoder,
+    make_one_hot_encoder,
     make_perturbation_network,
     make_qvalue_network,
     make_task_classifier,
@@ -81,11 +82,15 @@ class Student(nn.Module):
 
     Args:
         num_tasks: number of teachers.
-        task_latent_dim: size of m.
+        task_encoder: ``"transition"``, or ``"one_hot"``: m is the task's index, one-hot.
+        task_latent_dim: size of m where it is not one-hot.
         num_cells: widths of the hidden layers.
         latent_dim: size of ``action_latent``, the teachers'.
         observation_dim: size of the observation.
         action_dim: size of the action.
+
+    Raises:
+        UnknownNameError: for another encoder.
     """
 
     prototypes: Tensor
@@ -94,6 +99,7 @@ class Student(nn.Module):
         self,
         *,
         num_tasks: int,
+        task_encoder: str = "transition",
         task_latent_dim: int = 2,
         num_cells: Sequence[int] = (256, 256),
         latent_dim: int = 2 * ACTION_DIM,
@@ -103,7 +109,13 @@ class Student(nn.Module):
         super().__init__()
         dims = (observation_dim, action_dim)
         self.latent_dim = latent_dim
-        self.task_encoder = make_task_encoder(*dims, task_latent_dim, num_cells=num_cells)
+        if task_encoder not in TASK_ENCODERS:
+            raise UnknownNameError("task encoder", task_encoder, TASK_ENCODERS)
+        if task_encoder == "one_hot":
+            task_latent_dim = num_tasks
+            self.task_encoder = make_one_hot_encoder(num_tasks)
+        else:
+            self.task_encoder = make_task_encoder(*dims, task_latent_dim, num_cells=num_cells)
         self.task_classifier = make_task_classifier(num_tasks, task_latent_dim)
         self.generator = make_decoder(
             *dims, latent_dim, task_latent_dim=task_latent_dim, num_cells=num_cells
@@ -192,6 +204,7 @@ def make_distillation_loss(
 
 
 LATENT_SOURCES = ("prototype", "online", "demonstration")
+TASK_ENCODERS = ("transition", "one_hot")
 
 
 def load_student(path: Path) -> tuple[Student, dict[str, Any]]:

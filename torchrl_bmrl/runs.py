@@ -7,6 +7,7 @@ import json
 import math
 import os
 import platform
+import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,13 @@ import yaml
 
 from torchrl_bmrl import __version__
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
-from torchrl_bmrl.files import write_atomic
+from torchrl_bmrl.files import atomic_path, write_atomic
 
 FREE_TO_CHANGE = (
     "run_dir",
+    "base",
+    "preset",
+    "ablation",
     "workers",
     "stepper",
     "logger",
@@ -29,7 +33,17 @@ FREE_TO_CHANGE = (
 """Settings that do not change a run's result, and so may differ when it goes on.
 
 Studies of a finished run are among them; each is held to its own settings by its own folder.
+Presets and ablations are names of settings, which are compared themselves.
 """
+_START = ("seed", "tasks", "collect")
+ADOPTED: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("data/[!.]*.*", _START),
+    ("bcq/*/*.*", (*_START, "bcq")),
+    ("distill/*.*", (*_START, "bcq", "distill")),
+    ("evaluation/*-expert.csv", (*_START, "evaluate")),
+    ("evaluation/*-bcq.csv", (*_START, "bcq", "evaluate")),
+)
+"""What a run takes from its base: files, and the settings that decide them."""
 LOGGERS = ("csv", "wandb", "tensorboard", "none")
 PACKAGES = ("torch", "torchrl", "tensordict", "robosuite", "mujoco", "gymnasium", "numpy", "h5py")
 
@@ -37,7 +51,9 @@ PACKAGES = ("torch", "torchrl", "tensordict", "robosuite", "mujoco", "gymnasium"
 def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
     """Creates a run folder, or checks that an existing one was told the same.
 
-    Writes ``config.yaml`` (everything that decides the run) and ``versions.json``.
+    Writes ``config.yaml`` (everything that decides the run) and ``versions.json``. With ``base``
+    among the settings, another run's folder, a new run begins with those files of it that it would
+    only make again (:data:`ADOPTED`).
 
     Args:
         run_dir: the folder.
@@ -45,6 +61,7 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
 
     Raises:
         ConfigError: if the folder holds a run with other settings; the first that differs is named.
+        DataError: if ``base`` is not a run's folder.
 
     Example:
         >>> import tempfile
@@ -67,10 +84,29 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
                 "run; give the same settings to go on, or another run_dir"
             )
         return
+    if settings.get("base"):
+        _adopt(run_dir, Path(settings["base"]), settings)
     versions = {name: _version(name) for name in PACKAGES}
     versions |= {"torchrl_bmrl": __version__, "python": platform.python_version()}
     write_atomic(run_dir / "versions.json", json.dumps(versions, indent=2) + "\n")
     write_atomic(path, yaml.safe_dump(dict(settings), sort_keys=False))
+
+
+def _adopt(run_dir: Path, base: Path, settings: Mapping[str, Any]) -> None:
+    """Links what a run would only make again: a file is replaced, never changed, so it may be."""
+    theirs = read_settings(base)
+    for pattern, keys in ADOPTED:
+        if any(theirs.get(key) != settings.get(key) for key in keys):
+            continue
+        for source in base.glob(pattern):
+            target = run_dir / source.relative_to(base)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.unlink(missing_ok=True)  # of a start that was killed
+            try:
+                os.link(source, target)
+            except OSError:  # on another disk
+                with atomic_path(target) as path:
+                    shutil.copyfile(source, path)
 
 
 def read_settings(run_dir: Path) -> dict[str, Any]:

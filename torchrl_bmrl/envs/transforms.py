@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -229,6 +229,11 @@ class ObservationStatistics:
 
     loc: Tensor
     scale: Tensor
+
+    @classmethod
+    def from_lists(cls, lists: Mapping[str, Sequence[float]]) -> ObservationStatistics:
+        """Statistics as a checkpoint's metadata keep them."""
+        return cls(torch.tensor(lists["loc"]), torch.tensor(lists["scale"]))
 
     @classmethod
     def of(cls, datasets: Sequence[TensorDictBase]) -> ObservationStatistics:

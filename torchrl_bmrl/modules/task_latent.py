@@ -45,6 +45,27 @@ def make_task_encoder(
     return Network(network, in_keys=list(TRANSITION_KEYS), out_keys=["task_latent"])
 
 
+def make_one_hot_encoder(num_tasks: int) -> TensorDictModule:
+    """In place of :func:`make_task_encoder`: m is the task's index, one-hot; nothing is learned.
+
+    Reads ``task (*B,)``, int64; writes ``task_latent (*B, num_tasks)``.
+
+    Example:
+        >>> make_one_hot_encoder(3)(TensorDict({"task": torch.tensor([2])}, [1])).get("task_latent")
+        tensor([[0., 0., 1.]])
+    """
+    return Network(_OneHot(num_tasks), in_keys=["task"], out_keys=["task_latent"])
+
+
+class _OneHot(torch.nn.Module):
+    def __init__(self, num_tasks: int) -> None:
+        super().__init__()
+        self.num_tasks = num_tasks
+
+    def forward(self, task: Tensor) -> Tensor:
+        return torch.nn.functional.one_hot(task, self.num_tasks).to(torch.get_default_dtype())
+
+
 def make_task_classifier(num_tasks: int, task_latent_dim: int = 2) -> TensorDictModule:
     """Classifier :math:`P`: one linear layer from ``task_latent`` to ``task_logits``.
 
