@@ -2,8 +2,8 @@
 
 python recipes/export.py run_dir=runs/mine             # after recipes/evaluate.py
 
-Writes ``policy.safetensors`` and ``policy.md`` into the run folder. The file alone is enough to act:
-``recipes/evaluate.py evaluate.policy=policy.safetensors``.
+Writes ``policy.safetensors`` and ``policy.md`` into the run folder. The file alone is enough to
+act: ``recipes/evaluate.py evaluate.policy=policy.safetensors``.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ from torchrl_bmrl.runs import read_versions
 CARD = """# The distilled policy of preset {preset}, seed {seed}
 
 One policy for {tasks} with a simulated Sawyer arm and one cube (robosuite), steered by a task
-embedding m of {dim} numbers. {parameters:,} parameters: the encoder of m, its classifier, the generator
-of actions and the critic that chooses among them. The file also holds a point of m for each task, the
-statistics that normalise observations, and one held-out demonstration of each task.
+embedding m of {dim} numbers. {parameters:,} parameters: the encoder of m, its classifier, the
+generator of actions and the critic that chooses among them. The file also holds a point of m for
+each task, the statistics that normalise observations, and one held-out demonstration of each
+task.
 
 ```bash
 python recipes/evaluate.py evaluate.policy={name}
@@ -41,19 +42,19 @@ python recipes/evaluate.py evaluate.policy={name}
 
 ## Data
 
-Scripted experts with Gaussian noise of {noise} on every action, 200 steps an episode: {train}. {valid}
-further episodes of each task were held out. No person's and no robot's data.
+Scripted experts with Gaussian noise of {noise} on every action, 200 steps an episode: {train}.
+{valid} further episodes of each task were held out. No person's and no robot's data.
 
 ## Training
 
-Stage 1: a Batch-Constrained Q-learning agent for each task, {bcq_updates:,} updates of {bcq_batch}
-transitions, Adam at {bcq_lr:g}. Stage 2: {updates:,} updates of {batch} transitions of each task, Adam
-at {lr:g}. {versions}.
+Stage 1: a Batch-Constrained Q-learning agent for each task, {bcq_updates:,} updates of
+{bcq_batch} transitions, Adam at {bcq_lr:g}. Stage 2: {updates:,} updates of {batch} transitions
+of each task, Adam at {lr:g}. {versions}.
 
 ## Figures
 
-From starts that no demonstration had. A linear layer names the task of {accuracy:.2%} of the held-out
-transitions from m.
+From starts that no demonstration had. A linear layer names the task of {accuracy:.2%} of the
+held-out transitions from m.
 
 {table}
 ## Limits

@@ -222,6 +222,8 @@ class _Compiled:
         import torch._dynamo
         from tensordict.nn.functional_modules import _exclude_td_from_pytree
 
+        # Said again whenever an update is compiled anew, and nothing that a user could act on.
+        warnings.filterwarnings("ignore", r"Using lock_\(\) inside a compiled graph")
         # vmap over tensordicts does this at every call, and each would be compiled anew.
         _exclude_td_from_pytree().set()
         self.config = torch._dynamo.config
