@@ -32,7 +32,7 @@ from torchrl_bmrl.data.demonstrations import (
     read_statistics,
 )
 from torchrl_bmrl.envs.transforms import ObservationStatistics, make_env
-from torchrl_bmrl.errors import UnknownNameError
+from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome, evaluate_policy
 from torchrl_bmrl.experts.collect import collect_episode
@@ -190,9 +190,8 @@ def evaluate(config: Config) -> None:
     alone = config.evaluate.policy is not None
     if alone:
         known = load_student(student_path(config))[1]["tasks"]
-        for task in config.tasks:
-            if task not in known:
-                raise UnknownNameError("task of the policy", task, known)
+        if not set(config.tasks) <= set(known):
+            raise ConfigError(f"tasks is {config.tasks}; valid for {student_path(config)}: {known}")
     policies = [] if alone else [("expert", ""), ("bcq", "")]
     policies += [("distilled", source) for source in config.evaluate.latent_sources]
     jobs = [(config, task, *policy) for policy in policies for task in config.tasks]

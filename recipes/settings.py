@@ -151,8 +151,8 @@ class LatentSACSettings:
 class Config:
     """Everything that decides a run; ``config.yaml`` in the run folder is one of these."""
 
-    preset: str = "${hydra:runtime.choices.preset}"
-    ablation: str = "${hydra:runtime.choices.ablation}"
+    preset: str = MISSING  # the name
+    ablation: str = MISSING
     seed: int = 0
     run_dir: str = "runs/${hydra:job.name}-${name:${preset},${ablation}}-seed${seed}"
     base: str | None = None  # a run's folder: what this run would make again is taken from there

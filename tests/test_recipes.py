@@ -127,6 +127,8 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
         ("evaluate.latent_sources=[]", r"evaluate.latent_sources is \[\]"),
         ("evaluate.latent_sources=[mean]", "'mean'; .*prototype, online, demonstration"),
         ("distill.context=next", "distill.context 'next'; .*current, previous, random, set"),
+        ("distill.task_encoder=two_hot", "distill.task_encoder 'two_hot'; .*transition, one_hot"),
+        ("distill.task_encoder=one_hot", "task_encoder is one_hot.*isometry_weight=0"),
         ("distill.prototype=mode", "distill.prototype 'mode'; .*mean, medoid"),
         ("bcq.loss_function=l3", "bcq.loss_function 'l3'; .*l2, l1, smooth_l1"),
         ("bcq.kl_reduction=max", "bcq.kl_reduction 'max'; .*mean, sum"),
@@ -178,6 +180,53 @@ def test_the_presets_differ_in_what_their_names_say(recipes: Any, tmp_path: Path
     assert literal.distill.encoder_terms == ["classification"]
     assert literal.bcq == quick.bcq
     assert configured(f"run_dir={tmp_path}") == configured("preset=quick", f"run_dir={tmp_path}")
+
+
+ABLATIONS = sorted(path.stem for path in (RECIPES / "config" / "ablation").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("ablation", ABLATIONS)
+@pytest.mark.parametrize("preset", ["quick", "paper"])
+def test_an_ablation_is_valid_and_changes_one_group_of_settings_of_any_preset(
+    recipes: Any, tmp_path: Path, preset: str, ablation: str
+) -> None:
+    plain, config = (
+        OmegaConf.to_object(
+            configured(f"preset={preset}", f"ablation={name}", f"run_dir={tmp_path}")
+        )
+        for name in ("none", ablation)
+    )
+    recipes.check_settings(config)
+    assert (config.preset, config.ablation) == (preset, ablation)
+    groups = [group for group, value in vars(plain).items() if value != getattr(config, group)]
+    if ablation == "none":
+        assert not groups
+    elif (preset, ablation) == ("paper", "demos_all"):  # what it has anyway
+        assert groups == ["ablation"]
+    elif ablation == "one_hot":  # acts on a point alone, where the paper preset has three sources
+        assert {"ablation", "distill"} <= set(groups) <= {"ablation", "distill", "evaluate"}
+    else:
+        assert len(groups) == 2
+
+
+def test_what_each_ablation_takes_away_is_away(recipes: Any, tmp_path: Path) -> None:
+    def ablated(name: str) -> Any:
+        return OmegaConf.to_object(configured(f"ablation={name}", f"run_dir={tmp_path}"))
+
+    assert ablated("no_direction").distill.direction_weight == 0
+    assert ablated("no_isometry").distill.isometry_weight == 0
+    assert ablated("detached").distill.encoder_terms == ["classification"]
+    assert [ablated(f"dim{n}").distill.task_latent_dim for n in (4, 8)] == [4, 8]
+    assert ablated("one_hot").distill.task_encoder == "one_hot"
+    assert ablated("perturbation").bcq.perturbation
+    assert ablated("latent_clip_none").bcq.latent_clip is None
+    assert ablated("candidates_2").bcq.num_candidates == 2
+    assert [ablated(f"acting_{n}").evaluate.num_candidates for n in (1, 10)] == [1, 10]
+    assert [ablated(f"noise_{n}").collect.noise for n in (0, 40)] == [0.0, 0.4]
+    for n in (10, 50, 100):
+        assert set(ablated(f"demos_{n}").collect.train_episodes.values()) == {n}
+    paper = OmegaConf.to_object(configured("preset=paper", f"run_dir={tmp_path}"))
+    assert ablated("demos_all").collect == paper.collect
 
 
 # -- whole runs ------------------------------------------------------------------------------------
@@ -295,6 +344,75 @@ def test_two_stages_from_an_empty_folder_to_the_report_and_again(tmp_path: Path)
     assert done.returncode == 0, done.stderr
     assert times(folder) == written
     assert show_results(folder) == before
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_a_one_hot_student_learns_from_the_same_agents_and_acts(
+    run: Run, finished: Path, tmp_path: Path
+) -> None:
+    import two_stage
+
+    from torchrl_bmrl.agents import load_student
+
+    folder = run(
+        tmp_path / "run",
+        two_stage.two_stage,
+        "ablation=one_hot",
+        "evaluate.latent_sources=[prototype]",
+        f"base={finished}",
+    )
+    assert contents(folder, "data/*.hdf5") == contents(finished, "data/*.hdf5")
+    pattern = "bcq/*/checkpoint.safetensors"
+    assert contents(folder, pattern) == contents(finished, pattern)
+    student, metadata = load_student(folder / "distill" / "checkpoint.safetensors")
+    assert student.prototypes.tolist() == [[1.0, 0.0], [0.0, 1.0]]
+    assert metadata["accuracy"] == 1.0
+    rows = read_results(folder / "results.csv")
+    assert {row.latent_source for row in rows if row.policy == "distilled"} == {"prototype"}
+    assert "The figures of the embedding are left out" in (folder / "report.html").read_text()
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_an_exported_policy_acts_alone_as_it_does_in_its_run(
+    run: Run, finished: Path, tmp_path: Path
+) -> None:
+    import evaluate
+    import export
+
+    run(finished, export.export)
+    policy = shutil.copy(finished / "policy.safetensors", tmp_path)
+    alone = run(tmp_path / "alone", evaluate.evaluate, f"evaluate.policy={policy}")
+    distilled = [row for row in read_results(finished / "results.csv") if row.latent_source]
+    assert read_results(alone / "results.csv") == distilled
+    assert not (alone / "data").exists()
+    assert str(policy) in (alone / "report.html").read_text()
+    card = (finished / "policy.md").read_text()
+    assert "1 of reach, 1 of lift" in card
+    assert "| Lift | Distilled | online |" in card
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_a_policy_is_refused_for_a_task_that_it_was_not_trained_on(
+    run: Run, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import evaluate
+    import export
+
+    run(finished, export.export)
+    with pytest.raises(SystemExit, match="1"):
+        run(
+            tmp_path,
+            evaluate.evaluate,
+            f"evaluate.policy={finished / 'policy.safetensors'}",
+            "tasks=[reach,push_up]",
+        )
+    said = capsys.readouterr().err
+    assert "tasks is ['reach', 'push_up']; valid for" in said
+    assert said.endswith("policy.safetensors: ['reach', 'lift']\n")
+    assert not (tmp_path / "results.csv").exists()
 
 
 @pytest.mark.robosuite

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ pytest.importorskip("yaml")
 
 from torchrl_bmrl import __version__
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
+from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.runs import (
     check_finite,
     log_metrics,
@@ -64,7 +66,7 @@ def test_a_new_folder_says_what_it_was_told_and_on_what_it_runs(tmp_path: Path) 
     assert {"python", "torchrl", "tensordict"} <= versions.keys()
 
 
-@pytest.mark.parametrize("key", ["run_dir", "workers", "logger"])
+@pytest.mark.parametrize("key", ["run_dir", "workers", "logger", "base", "preset", "ablation"])
 def test_a_run_goes_on_with_the_same_settings_and_what_is_free_to_change(
     tmp_path: Path, key: str
 ) -> None:
@@ -73,6 +75,72 @@ def test_a_run_goes_on_with_the_same_settings_and_what_is_free_to_change(
     open_run(tmp_path, dict(reversed(SETTINGS.items())))
     open_run(tmp_path, changed(key, "other"))
     assert contents(tmp_path) == before
+
+
+BASE_FILES = {
+    "data/reach.hdf5": "collect",
+    "data/statistics.json": "collect",
+    "bcq/reach/checkpoint.safetensors": "bcq",
+    "bcq/reach/evaluations.csv": "bcq",
+    "distill/checkpoint.safetensors": "distill",
+    "evaluation/reach-expert.csv": "collect, evaluate",
+    "evaluation/reach-bcq.csv": "bcq, evaluate",
+}
+"""Files of a run, and the settings that decide them."""
+
+
+@pytest.mark.parametrize(
+    ("other", "taken"),
+    [
+        ({}, set(BASE_FILES)),
+        ({"workers": 7, "logger": "csv"}, set(BASE_FILES)),
+        ({"distill": {"updates": 2}}, set(BASE_FILES) - {"distill/checkpoint.safetensors"}),
+        ({"evaluate": {"episodes": 2}}, {name for name in BASE_FILES if "evaluation/" not in name}),
+        (
+            {"bcq": {"lr": 1.0}},
+            {"data/reach.hdf5", "data/statistics.json", "evaluation/reach-expert.csv"},
+        ),
+        ({"collect": {"noise": 0.0}}, set()),
+        ({"seed": 1}, set()),
+        ({"tasks": ["reach"]}, set()),
+    ],
+    ids=lambda value: ",".join(value) if isinstance(value, dict) else "",
+)
+def test_a_run_takes_from_its_base_what_it_would_only_make_again(
+    tmp_path: Path, other: dict[str, Any], taken: set[str]
+) -> None:
+    base, run = tmp_path / "base", tmp_path / "run"
+    sections = {"collect": {"noise": 0.2}, "distill": {"updates": 1}, "evaluate": {"episodes": 1}}
+    settings = SETTINGS | sections
+    open_run(base, settings)
+    for name in (*BASE_FILES, "data/.episodes/reach/0.npz", "evaluation/reach-distilled-x.csv"):
+        (base / name).parent.mkdir(parents=True, exist_ok=True)
+        (base / name).write_text(name)
+    open_run(run, settings | other | {"run_dir": str(run), "base": str(base)})
+    files = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
+    assert files == taken | {"config.yaml", "versions.json"}
+    # The base stays as it is when the run goes on, which replaces files.
+    write_atomic(run / "data" / "reach.hdf5", "other")
+    assert (base / "data" / "reach.hdf5").read_text() == "data/reach.hdf5"
+
+
+def test_a_base_on_another_disk_is_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise OSError("cross-device link")
+
+    base, run = tmp_path / "base", tmp_path / "run"
+    open_run(base, SETTINGS)
+    (base / "data").mkdir()
+    (base / "data" / "reach.hdf5").write_text("episodes")
+    monkeypatch.setattr(os, "link", refuse)
+    open_run(run, SETTINGS | {"base": str(base)})
+    assert (run / "data" / "reach.hdf5").read_text() == "episodes"
+
+
+def test_a_base_that_is_no_run_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such file; valid: the folder of a run"):
+        open_run(tmp_path / "run", SETTINGS | {"base": str(tmp_path / "nothing")})
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
