@@ -226,6 +226,7 @@ def run_facts(config: Config) -> dict[str, str]:
         f"{task} {config.collect.train_episodes[task]}" for task in config.tasks
     )
     return {
+        "Preset": config.preset + (f", {config.ablation}" if config.ablation != "none" else ""),
         "Seed": str(config.seed),
         "Demonstrations": f"{demonstrations}; {config.collect.valid_episodes} held out of each",
         "Stage 1": f"{config.bcq.epochs} epochs of {config.bcq.updates_per_epoch} updates",
