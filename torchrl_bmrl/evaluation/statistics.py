@@ -128,10 +128,10 @@ def relative_difference(
     ours, theirs = _vector("x", x), _vector("y", y)
     if len(ours) != len(theirs):
         raise BMRLError(f"x and y are pairs; got {len(ours)} and {len(theirs)} values")
+    layers = _split(len(ours), strata)
     parts = []  # of each group, the rows of its strata in an order that their own is lost in
     for rows in _split(len(ours), groups):
-        labels = None if strata is None else np.asarray(strata)[rows]
-        split = [rows[part] for part in _split(len(rows), labels)]
+        split = [part for layer in layers if len(part := np.intersect1d(rows, layer))]
         parts.append([part[np.lexsort((theirs[part], ours[part]))] for part in split])
         if not theirs[rows].mean() > 0.0:
             raise BMRLError(f"the mean of y is {theirs[rows].mean()}; valid: above 0")
@@ -201,17 +201,21 @@ def probability_of_improvement(
         [np.sort(values[rows]) for rows in _split(len(values), labels)]
         for values, labels in ((ours, x_strata), (theirs, y_strata))
     ]
-    pairs = list(zip(*groups, strict=True))
+    # How often each episode is drawn is all that a resample's probability depends on.
+    wins = [
+        np.greater.outer(mine, others) + 0.5 * np.equal.outer(mine, others)
+        for mine, others in zip(*groups, strict=True)
+    ]
 
     def probability(*resampled: NDArray[np.int64], axis: int) -> Any:
         drawn = iter(resampled)
         shares = []
-        for mine, others in pairs:
-            a, b = mine[next(drawn)][..., :, None], others[next(drawn)][..., None, :]
-            shares.append(((a > b) + 0.5 * (a == b)).mean(axis=(-2, -1)))
+        for win in wins:
+            a, b = (_counts(next(drawn), size) for size in win.shape)
+            shares.append(((a @ win) * b).sum(axis=axis) / win.size)
         return sum(shares) / len(shares)
 
-    sizes = [len(values) for pair in pairs for values in pair]
+    sizes = [size for win in wins for size in win.shape]
     return _estimate(sizes, probability, confidence=confidence, resamples=resamples, seed=seed)
 
 
@@ -266,6 +270,14 @@ def _percentiles(
         rng=np.random.default_rng(seed),
     ).confidence_interval
     return float(interval.low), float(interval.high)
+
+
+def _counts(rows: NDArray[np.int64], size: int) -> NDArray[np.float64]:
+    """How often each of ``size`` rows is drawn, shape ``(*B, n)`` to ``(*B, size)``."""
+    offsets = size * np.arange(rows.size // rows.shape[-1])
+    flat = rows.reshape(-1, rows.shape[-1]) + offsets[:, None]
+    counts = np.bincount(flat.ravel(), minlength=size * len(offsets))
+    return counts.reshape(*rows.shape[:-1], size).astype(np.float64)
 
 
 def _vector(name: str, values: ArrayLike) -> NDArray[np.float64]:
