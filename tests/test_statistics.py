@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.evaluation.statistics import bootstrap_interval
+from torchrl_bmrl.evaluation.statistics import (
+    bootstrap_interval,
+    probability_of_improvement,
+    relative_difference,
+)
 
 pytest.importorskip("scipy")
 
@@ -100,3 +106,142 @@ def test_seed_decides_the_interval() -> None:
 def test_bad_input_is_named(values: object, options: dict[str, object], message: str) -> None:
     with pytest.raises(BMRLError, match=message):
         bootstrap_interval(values, **options)  # type: ignore[arg-type]
+
+
+# What sets two policies apart
+
+
+def pairs(seed: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Returns of two policies from the same starts, which decide most of them, and their strata."""
+    rng = np.random.default_rng(seed)
+    strata = np.repeat([1, 2, 3], [12, 20, 9])
+    start = rng.normal(100.0, 20.0, strata.size)
+    noise = rng.normal(0.0, 2.0, (2, strata.size))
+    return 1.05 * start + noise[0], start + noise[1], strata
+
+
+def resampled(strata: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
+    """Rows drawn with replacement within each stratum."""
+    return np.concatenate(
+        [rng.choice(np.flatnonzero(strata == s), (strata == s).sum()) for s in (1, 2, 3)]
+    )
+
+
+def percentiles(values: list[float]) -> tuple[float, float]:
+    low, high = np.percentile(values, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def test_relative_difference_agrees_with_an_independent_paired_bootstrap() -> None:
+    x, y, strata = pairs()
+    rng = np.random.default_rng(7)
+    drawn = [resampled(strata, rng) for _ in range(5000)]
+    low, high = percentiles([x[rows].mean() / y[rows].mean() - 1 for rows in drawn])
+    found = relative_difference(x, y, strata=strata)
+    assert found.value == pytest.approx(x.mean() / y.mean() - 1)
+    assert (found.low, found.high) == pytest.approx((low, high), abs=0.08 * (high - low))
+
+
+def test_difficult_starts_are_no_difference() -> None:
+    x, y, strata = pairs()
+    found = relative_difference(x, y, strata=strata)
+    rng = np.random.default_rng(8)
+    rows = [(resampled(strata, rng), resampled(strata, rng)) for _ in range(2000)]
+    low, high = percentiles([x[a].mean() / y[b].mean() - 1 for a, b in rows])
+    assert found.high - found.low < 0.3 * (high - low)  # unpaired
+
+
+def test_relative_difference_over_groups_is_the_mean_of_theirs() -> None:
+    x, y, strata = pairs()
+    scale = np.where(strata == 2, 5.0, 1.0)  # a task of larger returns must not count for more
+    found = relative_difference(scale * x, scale * y, groups=strata)
+    each = [relative_difference(x[strata == s], y[strata == s]).value for s in (1, 2, 3)]
+    assert found.value == pytest.approx(np.mean(each))
+    assert found.low < found.value < found.high
+    rng = np.random.default_rng(9)
+    drawn = [resampled(strata, rng) for _ in range(5000)]
+    means = [
+        np.mean([x[r[strata == s]].mean() / y[r[strata == s]].mean() - 1 for s in (1, 2, 3)])
+        for r in drawn
+    ]
+    low, high = percentiles(means)
+    assert (found.low, found.high) == pytest.approx((low, high), abs=0.08 * (high - low))
+
+
+def test_probability_of_improvement_is_the_mean_of_mann_whitneys_over_strata() -> None:
+    from scipy.stats import mannwhitneyu
+
+    x, y, strata = pairs()
+    x, y = np.round(x, -1), np.round(y, -1)  # with ties
+    assert np.intersect1d(x, y).size
+    few = np.r_[0:5, 12:30, 32:41]  # of y, fewer than of x
+    each = []
+    for s in (1, 2, 3):
+        mine, others = x[strata == s], y[few][strata[few] == s]
+        each.append(mannwhitneyu(mine, others).statistic / (mine.size * others.size))
+    found = probability_of_improvement(x, y[few], x_strata=strata, y_strata=strata[few])
+    assert found.value == pytest.approx(np.mean(each))
+
+
+def test_interval_of_the_probability_agrees_with_an_independent_bootstrap() -> None:
+    x, y, strata = pairs()
+    rng = np.random.default_rng(10)
+    values = []
+    for _ in range(3000):
+        a, b = resampled(strata, rng), resampled(strata, rng)
+        shares = [(x[a][strata == s][:, None] > y[b][strata == s][None]).mean() for s in (1, 2, 3)]
+        values.append(np.mean(shares))
+    low, high = percentiles(values)
+    found = probability_of_improvement(x, y, x_strata=strata, y_strata=strata)
+    assert (found.low, found.high) == pytest.approx((low, high), abs=0.08 * (high - low))
+
+
+def test_the_order_of_rows_changes_nothing() -> None:
+    x, y, strata = pairs()
+    order, other = (np.random.default_rng(s).permutation(x.size) for s in (1, 2))
+    groups = np.arange(x.size) % 2
+    assert relative_difference(x, y, strata=strata, groups=groups) == relative_difference(
+        x[order], y[order], strata=strata[order], groups=groups[order]
+    )
+    assert probability_of_improvement(
+        x, y, x_strata=strata, y_strata=strata
+    ) == probability_of_improvement(
+        x[order], y[other], x_strata=strata[order], y_strata=strata[other]
+    )
+
+
+def test_constant_values_give_no_width() -> None:
+    x, y, strata = np.full(41, 90.0), np.full(41, 100.0), pairs()[2]
+    found = relative_difference(x, y, strata=strata)
+    assert found.low == found.high == found.value == pytest.approx(-0.1)
+    chance = probability_of_improvement(x, y, x_strata=strata, y_strata=strata)
+    assert (chance.value, chance.low, chance.high) == (0.0, 0.0, 0.0)
+    chance = probability_of_improvement(y, y, x_strata=strata, y_strata=strata)
+    assert (chance.value, chance.low, chance.high) == (0.5, 0.5, 0.5)
+
+
+def test_strata_of_one_episode_stay_what_they_are() -> None:
+    x, y = [110.0, 220.0, 230.0], [100.0, 200.0, 190.0]
+    found = relative_difference(x, y, strata=[0, 1, 1])
+    extremes = ((110 + 440) / 500 - 1, (110 + 460) / 480 - 1)
+    assert (found.low, found.high) == pytest.approx(extremes)
+    assert relative_difference([3.0], [2.0]).low == 0.5
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: relative_difference([1.0, 2.0], [1.0]), "2 and 1 values"),
+        (lambda: relative_difference([1.0], [0.0]), "mean of y is 0.0; valid: above 0"),
+        (lambda: relative_difference([1.0], [float("inf")]), "finite y.* 1 non-finite"),
+        (lambda: relative_difference([1.0, 2.0], [1.0, 2.0], groups=[1]), r"\(2,\), got \(1,\)"),
+        (
+            lambda: probability_of_improvement([1.0], [1.0], x_strata=[1], y_strata=[2]),
+            r"\[1\], those of y \[2\]",
+        ),
+        (lambda: probability_of_improvement([1.0], [1.0], confidence=2.0), "got 2.0"),
+    ],
+)
+def test_what_cannot_be_compared_is_named(call: Callable[[], object], message: str) -> None:
+    with pytest.raises(BMRLError, match=message):
+        call()

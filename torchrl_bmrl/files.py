@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import os
 import shutil
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -132,3 +133,106 @@ def write_rows(path: str | os.PathLike[str], rows: Sequence[Mapping[str, Any]]) 
     writer.writeheader()
     writer.writerows(rows)
     write_atomic(path, buffer.getvalue())
+
+
+def read_rows(
+    path: str | os.PathLike[str], columns: Mapping[str, Callable[[str], Any]]
+) -> list[dict[str, Any]]:
+    """Reads columns of a CSV file, each value through its column's parser; others are ignored.
+
+    Args:
+        path: The file.
+        columns: By name, what makes a value of a text. It raises ``ValueError`` with what is valid,
+            as :func:`whole`, :func:`finite` and :func:`one_of` do.
+
+    Returns:
+        One dictionary a line, in the file's order.
+
+    Raises:
+        DataError: if the file or a column is missing, or a value is not valid; the message names
+            the file, line, column, value and what is valid.
+
+    Example:
+        >>> import tempfile
+        >>> file = Path(tempfile.mkdtemp()) / "a.csv"
+        >>> write_rows(file, [{"epoch": 1, "return": 0.5}])
+        >>> read_rows(file, {"epoch": whole, "return": finite})
+        [{'epoch': 1, 'return': 0.5}]
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DataError(path, None, f"no such file; expected a CSV with {', '.join(columns)}")
+    rows = []
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        for column in columns:
+            if column not in (reader.fieldnames or ()):
+                raise DataError(
+                    path, column, f"column is missing; expected the columns {', '.join(columns)}"
+                )
+        for record in reader:
+            row = {}
+            for column, parse in columns.items():
+                text = record[column]
+                try:
+                    row[column] = parse(text or "")
+                except ValueError as error:
+                    found = "is missing" if text is None else f"is {text!r}"
+                    raise DataError(
+                        path,
+                        column,
+                        f"value in line {reader.line_num} {found}; expected {error}",
+                    ) from None
+            rows.append(row)
+    return rows
+
+
+def whole(text: str) -> int:
+    """A whole number.
+
+    Raises:
+        ValueError: if the text is none.
+
+    Example:
+        >>> whole("12")
+        12
+    """
+    try:
+        return int(text)
+    except ValueError:
+        raise ValueError("a whole number") from None
+
+
+def finite(text: str) -> float:
+    """A finite number.
+
+    Raises:
+        ValueError: if the text is none.
+
+    Example:
+        >>> finite("1e-3")
+        0.001
+    """
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError("a finite number")
+    return number
+
+
+def one_of(*valid: str) -> Callable[[str], str]:
+    """A parser of texts that are one of a few; it raises ``ValueError`` for another.
+
+    Example:
+        >>> one_of("a", "b")("b")
+        'b'
+    """
+
+    def parse(text: str) -> str:
+        if text not in valid:
+            raise ValueError(f"one of {', '.join(valid)}")
+        return text
+
+    return parse

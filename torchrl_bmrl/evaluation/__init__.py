@@ -11,15 +11,23 @@ from torchrl_bmrl.evaluation.results import (
     summarise,
     write_results,
 )
-from torchrl_bmrl.evaluation.statistics import bootstrap_interval
+from torchrl_bmrl.evaluation.statistics import (
+    Estimate,
+    bootstrap_interval,
+    probability_of_improvement,
+    relative_difference,
+)
 
 __all__ = [
     "POLICIES",
     "RESULT_FIELDS",
+    "Estimate",
     "ResultRow",
     "Summary",
     "bootstrap_interval",
+    "probability_of_improvement",
     "read_results",
+    "relative_difference",
     "summarise",
     "write_results",
 ]

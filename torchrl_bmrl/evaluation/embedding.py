@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.evaluation.statistics import bootstrap_interval
+from torchrl_bmrl.evaluation.statistics import Estimate, bootstrap_interval
 
 STAGE_TAIL = 10
 """Steps after success that count as the last stage, half a second.
@@ -25,25 +25,6 @@ STAGE_TAIL = 10
 A task succeeds as soon as its last stage has got far enough: cut there, a lift's last stage is a
 third as long as the others.
 """
-
-
-@dataclass(frozen=True, kw_only=True)
-class Estimate:
-    """A number and the interval that other episodes would have moved it in.
-
-    Attributes:
-        value: what was measured.
-        low: lower end of the 95% bootstrap interval over episodes.
-        high: upper end.
-    """
-
-    value: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        """The number and its interval, as tables print them."""
-        return f"{self.value:.2f} [{self.low:.2f}, {self.high:.2f}]"
 
 
 @dataclass(frozen=True, kw_only=True)

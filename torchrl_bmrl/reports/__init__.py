@@ -15,6 +15,7 @@ from torchrl_bmrl.reports.figures import (
 )
 from torchrl_bmrl.reports.page import Picture, Section, write_page
 from torchrl_bmrl.reports.report import read_stage1_curves, write_report
+from torchrl_bmrl.reports.results_page import check_results_page, write_results_page
 from torchrl_bmrl.reports.studies import read_studies, write_study
 from torchrl_bmrl.reports.tables import (
     Table,
@@ -33,6 +34,7 @@ __all__ = [
     "Picture",
     "Section",
     "Table",
+    "check_results_page",
     "embedding_scatter",
     "embedding_stages",
     "embedding_tsne",
@@ -51,5 +53,6 @@ __all__ = [
     "task_name",
     "write_page",
     "write_report",
+    "write_results_page",
     "write_study",
 ]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,7 +9,7 @@ import numpy as np
 
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.evaluation.results import Summary, read_results, summarise
-from torchrl_bmrl.files import write_atomic
+from torchrl_bmrl.files import finite, read_rows, whole, write_atomic
 from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports import paper
 from torchrl_bmrl.reports.embedding import (
@@ -43,7 +41,7 @@ from torchrl_bmrl.reports.tables import (
     task_name,
 )
 
-_CURVE_FIELDS = ("epoch", "update", "return")
+_CURVE_COLUMNS = {"epoch": whole, "update": whole, "return": finite}
 
 
 def read_stage1_curves(run_dir: Path) -> dict[str, Curve]:
@@ -129,7 +127,7 @@ def write_report(
         sections=[
             Section(
                 heading="Summary",
-                paragraphs=_headline(summaries, default_source=default_source, accuracy=accuracy),
+                paragraphs=headline(summaries, default_source=default_source, accuracy=accuracy),
             ),
             Section(
                 heading="Stage 1: one BCQ policy per task",
@@ -162,10 +160,23 @@ def _explore(explorer: Explorer | None) -> list[Section]:
     return [Section(heading=heading, paragraphs=explorer.paragraphs(), explorer=explorer)]
 
 
-def _headline(
+def headline(
     summaries: Sequence[Summary], *, default_source: str, accuracy: float | None
 ) -> list[str]:
-    """The few sentences that a hurried reader needs."""
+    """The few sentences that a hurried reader needs.
+
+    Args:
+        summaries: What :func:`torchrl_bmrl.evaluation.summarise` returns.
+        default_source: Source of m of the distilled policy.
+        accuracy: Held-out classification accuracy of the embedding, in [0, 1].
+
+    Returns:
+        One paragraph, or none.
+
+    Example:
+        >>> headline([], default_source="prototype", accuracy=0.998)[0][:31]
+        'A single linear layer tells a h'
+    """
     sentences = []
     bcq = {s.task: s for s in summaries if s.policy == "bcq"}
     if bcq:
@@ -325,22 +336,6 @@ def _measure_embeddings(
 
 def _read_curve(path: Path) -> Curve:
     epochs: dict[tuple[int, int], list[float]] = {}
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        for field in _CURVE_FIELDS:
-            if field not in (reader.fieldnames or ()):
-                raise DataError(path, field, "column is missing")
-        for record in reader:
-            numbers = [_number(record[f], path, f, reader.line_num) for f in _CURVE_FIELDS]
-            epochs.setdefault((int(numbers[0]), int(numbers[1])), []).append(numbers[2])
+    for row in read_rows(path, _CURVE_COLUMNS):
+        epochs.setdefault((row["epoch"], row["update"]), []).append(row["return"])
     return [(epoch, update, np.array(epochs[epoch, update])) for epoch, update in sorted(epochs)]
-
-
-def _number(text: str | None, path: Path, field: str, line: int) -> float:
-    try:
-        number = float(text or "")
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise DataError(path, field, f"value in line {line} is {text!r}; expected a finite number")
-    return number

@@ -10,13 +10,23 @@ from html import escape
 
 from torchrl_bmrl.evaluation.embedding import GoalDistanceResult, StageResult
 from torchrl_bmrl.evaluation.results import Summary
+from torchrl_bmrl.evaluation.statistics import Estimate
 from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports import paper
 
 MISSING = "–"
 """Cell of a number that was not measured."""
 
-_POLICY_NAMES = {"expert": "Expert", "bcq": "BCQ", "distilled": "Distilled"}
+_POLICY_NAMES = {
+    "expert": "Expert",
+    "bcq": "BCQ",
+    "distilled": "Distilled",
+    "bc": "BC",
+    "td3_bc": "TD3+BC",
+    "iql": "IQL",
+    "cql": "CQL",
+    "bcq_one_hot": "BCQ, one-hot task",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,12 +50,16 @@ class Table:
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
 
-    def markdown(self) -> str:
-        """The table as Markdown: title, caption, and a table with numbers to the right."""
+    def markdown(self, *, level: int = 2) -> str:
+        """The table as Markdown: title, caption, and a table with numbers to the right.
+
+        Args:
+            level: of the title among the headings.
+        """
         rule = ["---:" if self._is_numeric(column) else ":---" for column in range(self._width)]
         lines = [self.header, rule, *self.rows]
         cells = ["| " + " | ".join(c.replace("|", "\\|") for c in line) + " |" for line in lines]
-        return "\n".join([f"## {self.title}", "", self.caption, "", *cells, ""])
+        return "\n".join([f"{'#' * level} {self.title}", "", self.caption, "", *cells, ""])
 
     def csv(self) -> str:
         """Header and rows as CSV, without title and caption."""
@@ -88,6 +102,16 @@ def task_name(task: str) -> str:
     return task.replace("_", " ").title()
 
 
+def policy_name(policy: str) -> str:
+    """A policy's name as tables print it.
+
+    Example:
+        >>> policy_name("td3_bc")
+        'TD3+BC'
+    """
+    return _POLICY_NAMES[policy]
+
+
 def results_table(summaries: Sequence[Summary]) -> Table:
     """Everything that was evaluated: one line per task, policy and source of m.
 
@@ -123,7 +147,7 @@ def results_table(summaries: Sequence[Summary]) -> Table:
         rows=[
             (
                 task_name(s.task),
-                _POLICY_NAMES[s.policy],
+                policy_name(s.policy),
                 s.latent_source,
                 f"{s.mean_return:.1f}",
                 f"[{s.return_interval[0]:.1f}, {s.return_interval[1]:.1f}]",
@@ -138,12 +162,18 @@ def results_table(summaries: Sequence[Summary]) -> Table:
     )
 
 
-def table_1(summaries: Sequence[Summary], *, epochs: Mapping[str, int] | None = None) -> Table:
+def table_1(
+    summaries: Sequence[Summary],
+    *,
+    epochs: Mapping[str, int] | None = None,
+    differences: Mapping[str, Estimate] | None = None,
+) -> Table:
     """The paper's Table 1, expert against BCQ, beside the measured returns.
 
     Args:
         summaries: What :func:`torchrl_bmrl.evaluation.summarise` returns.
         epochs: Stage-1 epochs trained here, by task.
+        differences: Relative difference of BCQ to the expert by task, whose interval is printed.
 
     Example:
         >>> table_1([]).rows[0][:5]
@@ -163,7 +193,7 @@ def table_1(summaries: Sequence[Summary], *, epochs: Mapping[str, int] | None = 
                 str(printed.epochs),
                 _mean_return(expert),
                 _mean_return(bcq),
-                _share(bcq, expert),
+                _share(bcq, expert, (differences or {}).get(task)),
                 str((epochs or {}).get(task, MISSING)),
                 _success(bcq),
             )
@@ -172,9 +202,9 @@ def table_1(summaries: Sequence[Summary], *, epochs: Mapping[str, int] | None = 
         title="Table 1: stage 1, one BCQ policy per task",
         caption=(
             "Mean return over 200 steps of the scripted expert and of the BCQ policy trained on "
-            "its demonstrations; paper beside this run. Simulator, experts and number of "
-            "demonstrations differ, so compare the shares rather than the returns. An epoch is a "
-            "stretch of training between two evaluations, and its length differs as well."
+            "its demonstrations; paper beside this run. Simulator and experts differ, and the "
+            "number of demonstrations may, so compare the shares rather than the returns. An "
+            "epoch is a stretch of training between two evaluations; its length differs as well."
         ),
         header=(
             "Task",
@@ -192,12 +222,19 @@ def table_1(summaries: Sequence[Summary], *, epochs: Mapping[str, int] | None = 
     )
 
 
-def table_2(summaries: Sequence[Summary], *, default_source: str) -> Table:
+def table_2(
+    summaries: Sequence[Summary],
+    *,
+    default_source: str,
+    differences: Mapping[str, Estimate] | None = None,
+) -> Table:
     """The paper's Table 2, the distilled policy against BCQ, beside the measured returns.
 
     Args:
         summaries: What :func:`torchrl_bmrl.evaluation.summarise` returns.
         default_source: Source of m whose columns come first; every other one found follows.
+        differences: Relative difference to BCQ by task, with the default source, whose interval is
+            printed.
 
     Example:
         >>> table_2([], default_source="prototype").rows[0]
@@ -216,7 +253,9 @@ def table_2(summaries: Sequence[Summary], *, default_source: str) -> Table:
         ]
         for source in sources:
             distilled = found.get((task, "distilled", source))
-            cells += [_mean_return(distilled), _share(distilled, bcq), _success(distilled)]
+            interval = (differences or {}).get(task) if source == default_source else None
+            share = _share(distilled, bcq, interval)
+            cells += [_mean_return(distilled), share, _success(distilled)]
         rows.append(tuple(cells))
     measured = [
         f"{source}: {column}" for source in sources for column in ("return", "% of BCQ", "success")
@@ -334,10 +373,15 @@ def _success(summary: Summary | None) -> str:
     return MISSING if summary is None else f"{summary.success_rate:.0%}"
 
 
-def _share(summary: Summary | None, reference: Summary | None) -> str:
+def _share(
+    summary: Summary | None, reference: Summary | None, difference: Estimate | None = None
+) -> str:
     if summary is None or reference is None or reference.mean_return <= 0.0:
         return MISSING
-    return f"{summary.mean_return / reference.mean_return:.1%}"
+    share = f"{summary.mean_return / reference.mean_return:.1%}"
+    if difference is None:
+        return share
+    return f"{share} [{100 * (1 + difference.low):.1f}, {100 * (1 + difference.high):.1f}]"
 
 
 def _has_digit(text: str) -> bool:

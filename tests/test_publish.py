@@ -1,0 +1,207 @@
+"""The recipe that publishes: what it takes from run folders, and the command of a run."""
+
+# ruff: noqa: E402 -- the package's imports need the extras that the skip checks
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+for extra in ("hydra", "h5py", "robosuite", "safetensors", "scipy", "matplotlib", "sklearn"):
+    pytest.importorskip(extra)
+
+import yaml
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from published_data import make_rows
+
+from torchrl_bmrl.checkpoint import save_checkpoint
+from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
+from torchrl_bmrl.evaluation import ResultRow, write_results
+from torchrl_bmrl.files import write_rows
+from torchrl_bmrl.names import TASKS
+from torchrl_bmrl.reports.published import read_published
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+
+
+@pytest.fixture
+def publish() -> Iterator[Any]:
+    """The recipe's module, importable as it is for a script beside it."""
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        initialize_config_dir(str(RECIPES / "config"), version_base="1.3"),
+    ):
+        patch.syspath_prepend(str(RECIPES))
+        import publish
+
+        yield publish
+
+
+def make_settings(*overrides: str) -> dict[str, Any]:
+    """What ``config.yaml`` holds of a run with these overrides."""
+    config = compose("recipe", [*overrides, "run_dir=runs/a"])
+    # Names of presets are resolved by hydra alone; runs of before they were recorded have none.
+    settings = OmegaConf.to_container(config, resolve=False)
+    return {key: value for key, value in settings.items() if key not in ("preset", "ablation")}
+
+
+def rows_of(seed: int, *policies: str) -> list[ResultRow]:
+    return [row for row in make_rows(seed, episodes=2) if row.policy in policies]
+
+
+def make_folder(path: Path, *overrides: str, seed: int = 3) -> Path:
+    """A small finished run."""
+    settings = make_settings(*overrides, f"seed={seed}")
+    path.mkdir()
+    (path / "config.yaml").write_text(yaml.safe_dump(settings))
+    (path / "versions.json").write_text(json.dumps({"torch": "2.13", "commit": "abc"}))
+    (path / "seconds.json").write_text(json.dumps({"collect": 30.0, "stage 1": 60.0}))
+    write_results(path / "results.csv", rows_of(seed, "expert", "bcq"))
+    metadata = {"kind": "student", "accuracy": 0.987654321, "student": {"task_latent_dim": 4}}
+    (path / "distill").mkdir()
+    save_checkpoint(path / "distill" / "checkpoint.safetensors", {"a": torch.ones(1)}, metadata)
+    for task in TASKS:
+        curve = [{"epoch": 1, "update": 9, "episode": 0, "return": 1 / 3, "success": 1}]
+        write_rows(path / "bcq" / task / "evaluations.csv", curve)
+    return path
+
+
+def test_a_folder_becomes_rows(publish: Any, tmp_path: Path) -> None:
+    run_dir = make_folder(tmp_path / "run", "preset=paper")
+    write_results(run_dir / "baselines.csv", rows_of(3, "bc"))
+    docs = tmp_path / "docs"
+    publish.publish(publish.Settings(runs=[str(run_dir)], docs=str(docs)))
+    published = read_published(docs / "results")
+    (run,) = published.runs
+    assert run.key == ("paper", "none", 3)
+    assert run.command == "python recipes/two_stage.py preset=paper seed=3"
+    assert (run.commit, run.versions) == ("abc", "torch 2.13")
+    assert (run.accuracy, run.task_latent_dim) == (0.98765, 4)
+    assert (run.seconds_stage_1, run.seconds_stage_2) == (60.0, None)
+    assert {e.row for e in published.episodes} == set(rows_of(3, "expert", "bcq", "bc"))
+    assert [(c.task, c.seed, c.episode_return) for c in published.curves] == [
+        (task, 3, 0.333) for task in TASKS
+    ]
+    publish.publish(publish.Settings(check=True, docs=str(docs)))
+
+
+def test_publishing_again_changes_nothing(publish: Any, tmp_path: Path) -> None:
+    runs = [str(make_folder(tmp_path / str(s), "preset=paper", seed=s)) for s in (1, 2)]
+    docs = tmp_path / "docs"
+
+    def published(order: list[str]) -> dict[Path, bytes]:
+        publish.publish(publish.Settings(runs=order, docs=str(docs)))
+        return {path: path.read_bytes() for path in docs.rglob("*") if path.is_file()}
+
+    first = published(runs)
+    assert published(runs[::-1]) == published(runs[:1]) == published([]) == first
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["preset=paper"],
+        ["preset=quick", "bcq.lmbda=0.9"],
+        ["preset=literal", "distill.encoder_terms=[generator,qvalue]", "bcq.latent_clip=null"],
+        ["preset=compose", "tasks=[lift,reach]", "collect.gains.position=3.0", "bcq.stacked=true"],
+    ],
+)
+def test_the_command_of_a_run_gives_its_settings(publish: Any, overrides: list[str]) -> None:
+    settings = make_settings(*overrides, "seed=5", "workers=1")
+    preset, command = publish.command_of(settings)
+    assert f"preset={preset}" == overrides[0]
+    python, recipe, *words = shlex.split(command)
+    assert (python, recipe) == ("python", "recipes/two_stage.py")
+    assert len(words) == len(overrides) + 1  # and the seed
+    again = make_settings(*words)
+    assert again | {"workers": 1} == settings
+
+
+def test_a_recorded_preset_is_the_run_s(publish: Any) -> None:
+    settings = make_settings("preset=quick")
+    preset, command = publish.command_of(settings | {"preset": "paper"})
+    assert preset == "paper"
+    assert make_settings(*shlex.split(command)[2:]) == settings
+    with pytest.raises(ConfigError, match=r"preset is huge in the run; valid: compose, .*quick"):
+        publish.command_of(settings | {"preset": "huge"})
+
+
+def test_a_setting_that_is_gone_is_named(publish: Any) -> None:
+    settings = make_settings()
+    with pytest.raises(ConfigError, match=r"bcq\.magic is a setting of the run"):
+        publish.command_of(settings | {"bcq": {**settings["bcq"], "magic": 1}})
+
+
+def broken(path: Path, name: str, content: str | None) -> None:
+    (path / name).unlink() if content is None else (path / name).write_text(content)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("config.yaml", None),
+        ("versions.json", None),
+        ("results.csv", None),
+        ("distill/checkpoint.safetensors", None),
+        ("seconds.json", "{"),
+        ("bcq/lift/evaluations.csv", "epoch,update\n"),
+    ],
+)
+def test_a_damaged_folder_leaves_what_was_published(
+    publish: Any, tmp_path: Path, name: str, content: str | None
+) -> None:
+    docs = tmp_path / "docs"
+    good = make_folder(tmp_path / "good", "preset=paper", seed=1)
+    publish.publish(publish.Settings(runs=[str(good)], docs=str(docs)))
+    before = {p: p.read_bytes() for p in docs.rglob("*") if p.is_file()}
+    bad = make_folder(tmp_path / "bad", "preset=paper", seed=2)
+    broken(bad, name, content)
+    with pytest.raises(BMRLError, match=name):
+        publish.publish(publish.Settings(runs=[str(bad)], docs=str(docs)))
+    assert {p: p.read_bytes() for p in docs.rglob("*") if p.is_file()} == before
+
+
+def test_episodes_of_another_seed_are_refused(publish: Any, tmp_path: Path) -> None:
+    run_dir = make_folder(tmp_path / "run", "preset=paper")
+    rows = [replace(row, seed=8) for row in rows_of(3, "expert", "bcq")]
+    write_results(run_dir / "results.csv", rows)
+    with pytest.raises(DataError, match="seed: 8; the run's is 3"):
+        publish.publish(publish.Settings(runs=[str(run_dir)], docs=str(tmp_path / "docs")))
+
+
+def test_the_check_exits_with_one_line_when_a_number_was_changed(tmp_path: Path) -> None:
+    docs = tmp_path / "docs"
+    with initialize_config_dir(str(RECIPES / "config"), version_base="1.3"):
+        run_dir = make_folder(tmp_path / "run", "preset=quick")
+
+    def recipe(*overrides: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, str(RECIPES / "publish.py"), *overrides, f"docs={docs}"],
+            cwd=tmp_path,
+            env=os.environ,
+            capture_output=True,
+            text=True,
+            timeout=600,
+        )
+
+    assert recipe(f"runs=[{run_dir}]").returncode == 0
+    assert recipe("check=true").returncode == 0
+    path = docs / "results" / "runs.csv"
+    with path.open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    write_rows(path, [row | {"seconds_collect": "999.0"}])
+    result = recipe("check=true")
+    assert result.returncode == 1
+    assert len(result.stderr.splitlines()) == 1
+    assert result.stderr.startswith(f"error: {docs / 'results.md'}: line ")

@@ -1,0 +1,333 @@
+"""The page of published results, in Markdown: a function of the three CSV files alone."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from itertools import zip_longest
+from pathlib import Path
+
+import numpy as np
+
+from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.evaluation.results import ResultRow, Summary, summarise
+from torchrl_bmrl.evaluation.statistics import Estimate
+from torchrl_bmrl.files import write_atomic
+from torchrl_bmrl.names import TASKS
+from torchrl_bmrl.reports.comparisons import (
+    BCQ,
+    DEFAULT_SOURCE,
+    DISTILLED,
+    EXPERT,
+    Arm,
+    ablations_table,
+    arms_of,
+    clock_table,
+    difference,
+    differences_table,
+    gains_table,
+    policies_table,
+    seeds_table,
+    spread_table,
+    targets,
+    targets_table,
+)
+from torchrl_bmrl.reports.figures import Curve, stage1_curves
+from torchrl_bmrl.reports.page import Picture, Section
+from torchrl_bmrl.reports.published import MAIN, CurveRow, Published, RunRow, read_published
+from torchrl_bmrl.reports.report import headline
+from torchrl_bmrl.reports.tables import policy_name, results_table, table_1, table_2
+
+CURVES = "images/results_curves.png"
+"""The one picture, below the folder of the page."""
+
+_TEXTS = files("torchrl_bmrl.reports")
+_HEAD = _TEXTS.joinpath("results_head.md").read_text(encoding="utf-8")
+_RETURNS = _TEXTS.joinpath("results_returns.md").read_text(encoding="utf-8")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultsPage:
+    """A page and its picture.
+
+    Attributes:
+        text: Markdown.
+        curves: PNG image that the text shows as :data:`CURVES`; ``None`` without curves.
+    """
+
+    text: str
+    curves: bytes | None
+
+
+def make_results_page(published: Published) -> ResultsPage:
+    """The page that published results give; a section without data is left out.
+
+    Args:
+        published: what :func:`torchrl_bmrl.reports.published.read_published` returns.
+
+    Example:
+        >>> make_results_page(Published()).text.splitlines()[0]
+        '# Results'
+    """
+    rows = [e.row for e in published.episodes if e.key[:2] == MAIN]
+    runs = [run for run in published.runs if run.key[:2] == MAIN]
+    summaries = summarise(rows)
+    sections = [
+        *_main_sections(rows, summaries, runs, published.curves),
+        *_ablations(published),
+        *_runs(published.runs, baselines=bool(_baselines(rows))),
+        Section(heading="Why returns differ from the paper's", paragraphs=[_RETURNS.rstrip()]),
+    ]
+    if summaries:
+        sections.append(Section(heading="Everything measured", tables=[results_table(summaries)]))
+    pictures = [picture.png for section in sections for picture in section.pictures]
+    text = "\n".join([_HEAD, *map(_markdown, sections)])
+    return ResultsPage(text=text.rstrip("\n") + "\n", curves=pictures[0] if pictures else None)
+
+
+def write_results_page(folder: str | os.PathLike[str]) -> Path:
+    """Writes ``results.md`` and its pictures from the CSV files in ``results/``.
+
+    Args:
+        folder: the folder of the page.
+
+    Returns:
+        Path of the page.
+
+    Raises:
+        DataError: if a CSV file is not valid.
+    """
+    folder = Path(folder)
+    page = make_results_page(read_published(folder / "results"))
+    if page.curves is not None:
+        write_atomic(folder / CURVES, page.curves)
+    write_atomic(folder / "results.md", page.text)
+    return folder / "results.md"
+
+
+def check_results_page(folder: str | os.PathLike[str]) -> None:
+    """Checks that ``results.md`` is what the CSV files give, and that its picture is there.
+
+    The picture is not compared: its bytes depend on the libraries that draw it. The table beside it
+    is computed from the same rows.
+
+    Args:
+        folder: the folder of the page.
+
+    Raises:
+        DataError: naming the first line that differs, or the picture if it is missing.
+    """
+    folder = Path(folder)
+    path = folder / "results.md"
+    page = make_results_page(read_published(folder / "results"))
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    again = "write it with python recipes/publish.py"
+    if text != page.text:
+        pairs = enumerate(zip_longest(text.split("\n"), page.text.split("\n")), start=1)
+        line, (here, there) = next((line, pair) for line, pair in pairs if pair[0] != pair[1])
+        message = f"line {line} is {here!r}, the CSV files give {there!r}; {again}"
+        raise DataError(path, None, message)
+    if page.curves is not None and not (folder / CURVES).is_file():
+        raise DataError(folder / CURVES, None, f"no such picture; {again}")
+
+
+def _main_sections(
+    rows: Sequence[ResultRow],
+    summaries: Sequence[Summary],
+    runs: Sequence[RunRow],
+    curves: Sequence[CurveRow],
+) -> list[Section]:
+    """What the runs of the paper's sizes gave."""
+    if not rows:
+        return []
+    accuracies = [run.accuracy for run in runs if run.accuracy is not None]
+    seeds = ", ".join(str(seed) for seed in sorted({row.seed for row in rows}))
+    episodes = len(rows)
+    asked = targets(rows, summaries, runs)
+    drawn = _curves(curves)
+    sections = [
+        Section(
+            heading="In short",
+            paragraphs=[
+                f"Preset `{MAIN[0]}`, training seeds {seeds}; {episodes:,} evaluated episodes.",
+                *headline(
+                    summaries,
+                    default_source=DEFAULT_SOURCE,
+                    accuracy=float(np.mean(accuracies)) if accuracies else None,
+                ),
+            ],
+            tables=[*([targets_table(asked)] if asked else []), seeds_table(rows, runs)],
+        ),
+        Section(
+            heading="The paper's tables",
+            tables=[
+                table_1(
+                    summaries,
+                    epochs={task: curve[-1][0] for task, curve in drawn.items()},
+                    differences=_differences(rows, BCQ, EXPERT),
+                ),
+                table_2(
+                    [s for s in summaries if s.latent_source in ("", DEFAULT_SOURCE)],
+                    default_source=DEFAULT_SOURCE,
+                    differences=_differences(rows, DISTILLED, BCQ),
+                ),
+            ],
+        ),
+        _over_the_expert(rows),
+        _sources(rows, summaries),
+        _figure_3(drawn, summaries),
+        _stages(rows, summaries),
+    ]
+    return [section for section in sections if section.tables or section.paragraphs]
+
+
+def _over_the_expert(rows: Sequence[ResultRow]) -> Section:
+    table = differences_table(rows, [BCQ, DISTILLED], EXPERT)
+    return Section(heading="Over the expert", tables=[table] if table.rows else [])
+
+
+def _sources(rows: Sequence[ResultRow], summaries: Sequence[Summary]) -> Section:
+    """Where the distilled policy takes m from, if it was asked with more than one source."""
+    arms = {
+        arm: f"{arm[1]} (default)" if arm == DISTILLED else arm[1]
+        for arm in arms_of(rows)
+        if arm[0] == "distilled"
+    }
+    if len(arms) < 2:
+        return Section(heading="")
+    return Section(
+        heading="Where m comes from",
+        tables=[
+            policies_table(
+                rows,
+                summaries,
+                arms,
+                BCQ,
+                title="The distilled policy by its source of m",
+                caption=(
+                    "Prototype: one fixed point for each task. Online: the embedding of the last "
+                    "transition. Demonstration: the embeddings of one held-out demonstration."
+                ),
+            )
+        ],
+    )
+
+
+def _curves(rows: Sequence[CurveRow]) -> dict[str, Curve]:
+    """Returns by task and epoch, the episodes of all seeds together."""
+    found: dict[str, dict[tuple[int, int], list[float]]] = {}
+    for row in rows:
+        epochs = found.setdefault(row.task, {})
+        epochs.setdefault((row.epoch, row.update), []).append(row.episode_return)
+    return {
+        task: [(*epoch, np.array(epochs[epoch])) for epoch in sorted(epochs)]
+        for task, epochs in sorted(found.items(), key=lambda item: TASKS.index(item[0]))
+    }
+
+
+def _figure_3(curves: dict[str, Curve], summaries: Sequence[Summary]) -> Section:
+    if not curves:
+        return Section(heading="")
+    experts = {s.task: s.mean_return for s in summaries if s.policy == "expert"}
+    return Section(
+        heading="The paper's figure 3",
+        tables=[spread_table(curves)],
+        pictures=[
+            Picture(
+                png=stage1_curves(curves, expert_means=experts),
+                alt="Return of BCQ against training epoch, one panel per task",
+                caption=(
+                    "Return of the BCQ policy, rolled out after each epoch of stage 1: mean, and "
+                    "a band of one standard deviation over episodes and seeds to either side. "
+                    "Dashed: mean return of the expert. The paper shows the pushes."
+                ),
+            )
+        ],
+    )
+
+
+def _baselines(rows: Sequence[ResultRow]) -> list[Arm]:
+    return [arm for arm in arms_of(rows) if arm[0] not in ("expert", "bcq", "distilled")]
+
+
+def _stages(rows: Sequence[ResultRow], summaries: Sequence[Summary]) -> Section:
+    """Other algorithms on the same demonstrations, if there are any."""
+    baselines = _baselines(rows)
+    if not baselines:
+        return Section(heading="")
+    present = [arm for arm in (BCQ, DISTILLED) if arm in arms_of(rows)]
+    pairs = [
+        (BCQ, EXPERT),
+        *((BCQ, arm) for arm in baselines if arm[0] != "bcq_one_hot"),
+        (DISTILLED, BCQ),
+        *((DISTILLED, arm) for arm in baselines if arm[0] == "bcq_one_hot"),
+    ]
+    gains = gains_table(rows, pairs)
+    return Section(
+        heading="Beside other algorithms",
+        tables=[
+            policies_table(
+                rows,
+                summaries,
+                {arm: policy_name(arm[0]) for arm in (*present, *baselines)},
+                EXPERT,
+                title="Policies and tasks",
+                caption=(
+                    "All learn from the same demonstrations. BC, TD3+BC, IQL and CQL are "
+                    "TorchRL's losses, one policy for each task as BCQ; BCQ with a one-hot task "
+                    "is one policy for all tasks, trained at once and told the task's index."
+                ),
+            ),
+            *([gains] if gains.rows else []),
+        ],
+    )
+
+
+def _ablations(published: Published) -> list[Section]:
+    table = ablations_table(published.episodes, published.runs)
+    return [Section(heading="Ablations", tables=[table])] if table.rows else []
+
+
+def _runs(runs: Sequence[RunRow], *, baselines: bool) -> list[Section]:
+    """How long it took, how to do it again, and with what."""
+    if not runs:
+        return []
+    more = " The other algorithms: the same settings with `recipes/baselines.py`, afterwards."
+    versions: dict[str, list[str]] = {}
+    for run in runs:
+        commit = f"commit {run.commit}, " if run.commit else ""
+        versions.setdefault(f"{commit}{run.versions}", []).append("/".join(map(str, run.key)))
+    return [
+        Section(heading="How long it took", tables=[clock_table(runs)]),
+        Section(
+            heading="Again",
+            paragraphs=[
+                "The same runs, and then this page from their folders." + more * baselines,
+                "\n".join(
+                    [
+                        "```bash",
+                        *(run.command for run in runs),
+                        'python recipes/publish.py "runs=[FOLDER,FOLDER]"',
+                        "python recipes/publish.py check=true    # whether the page is up to date",
+                        "```",
+                    ]
+                ),
+                "Versions, with the runs' preset, ablation and seed:",
+                "\n".join(f"- {text} ({', '.join(keys)})" for text, keys in versions.items()),
+            ],
+        ),
+    ]
+
+
+def _differences(rows: Sequence[ResultRow], x: Arm, y: Arm) -> dict[str, Estimate]:
+    found = {task: difference(rows, rows, x, y, [task]) for task in TASKS}
+    return {task: gain for task, gain in found.items() if gain is not None}
+
+
+def _markdown(section: Section) -> str:
+    pictures = [f"![{p.alt}]({CURVES})\n\n{p.caption}\n" for p in section.pictures]
+    tables = [table.markdown(level=3) for table in section.tables]
+    paragraphs = [f"{text}\n" for text in section.paragraphs]
+    return "\n".join([f"## {section.heading}\n", *paragraphs, *pictures, *tables])
