@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +78,34 @@ def test_a_run_goes_on_with_the_same_settings_and_what_is_free_to_change(
     open_run(tmp_path, dict(reversed(SETTINGS.items())))
     open_run(tmp_path, changed(key, "other"))
     assert contents(tmp_path) == before
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="no git")
+def test_a_run_names_the_commit_of_its_sources_and_no_other_repositorys(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def git(*words: str) -> None:
+        who = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        subprocess.run(["git", *who, "-C", str(tmp_path), *words], check=True, capture_output=True)
+
+    def commit(number: int) -> str | None:
+        open_run(tmp_path / "runs" / str(number), SETTINGS)
+        return read_versions(tmp_path / "runs" / str(number)).get("commit")
+
+    sources = tmp_path / "runs.py"
+    monkeypatch.setattr("torchrl_bmrl.runs.__file__", str(sources))
+    sources.write_text("first")
+    assert commit(0) is None
+    git("init")
+    git("commit", "--allow-empty", "-m", "somebody else's")
+    assert commit(1) is None
+    git("add", "runs.py")
+    git("commit", "-m", "ours")
+    known = commit(2)
+    assert known is not None
+    assert re.fullmatch("[0-9a-f]{7,}", known)
+    sources.write_text("changed")
+    assert commit(3) == f"{known}+"
 
 
 BASE_FILES = {

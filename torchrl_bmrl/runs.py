@@ -8,6 +8,7 @@ import math
 import os
 import platform
 import shutil
+import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,8 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
         _adopt(run_dir, Path(settings["base"]), settings)
     versions = {name: _version(name) for name in PACKAGES}
     versions |= {"torchrl_bmrl": __version__, "python": platform.python_version()}
+    if commit := _commit():
+        versions["commit"] = commit
     write_atomic(run_dir / "versions.json", json.dumps(versions, indent=2) + "\n")
     write_atomic(path, yaml.safe_dump(dict(settings), sort_keys=False))
 
@@ -144,6 +147,21 @@ def _version(package: str) -> str | None:
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _commit() -> str | None:
+    """Commit of the sources, with a ``+`` where they were changed since; ``None`` outside git."""
+    source = Path(__file__)
+    git = ["git", "-C", str(source.parent)]
+    try:
+        # An installed copy may lie within another project's repository, which ignores it.
+        subprocess.run(
+            [*git, "ls-files", "--error-unmatch", source.name], capture_output=True, check=True
+        )
+        command = [*git, "describe", "--always", "--exclude=*", "--dirty=+"]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
         return None
 
 
