@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ import torch
 
 pytest.importorskip("yaml")
 
-from torchrl_bmrl import __version__
+from torchrl_bmrl import __version__, runs
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
 from torchrl_bmrl.runs import (
     check_finite,
@@ -62,6 +64,26 @@ def test_a_new_folder_says_what_it_was_told_and_on_what_it_runs(tmp_path: Path) 
     assert versions["torchrl_bmrl"] == __version__
     assert versions["torch"] == torch.__version__
     assert {"python", "torchrl", "tensordict"} <= versions.keys()
+
+
+def test_a_run_from_a_clone_names_its_commit(tmp_path: Path) -> None:
+    root = Path(__file__).parents[1]
+    if not (root / ".git").exists() or shutil.which("git") is None:
+        pytest.skip("not a clone")
+    open_run(tmp_path, SETTINGS)
+    command = ["git", "-C", str(root), "rev-parse", "HEAD"]
+    head = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    commit = read_versions(tmp_path)["commit"].removesuffix("-dirty")
+    assert len(commit) >= 7
+    assert head.startswith(commit)
+
+
+def test_a_package_that_is_no_clone_has_no_commit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runs, "__file__", str(tmp_path / "torchrl_bmrl" / "runs.py"))
+    open_run(tmp_path / "run", SETTINGS)
+    assert "commit" not in read_versions(tmp_path / "run")
 
 
 @pytest.mark.parametrize("key", ["run_dir", "workers", "logger"])

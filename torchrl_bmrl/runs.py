@@ -7,6 +7,7 @@ import json
 import math
 import os
 import platform
+import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -68,7 +69,7 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
             )
         return
     versions = {name: _version(name) for name in PACKAGES}
-    versions |= {"torchrl_bmrl": __version__, "python": platform.python_version()}
+    versions |= {"torchrl_bmrl": __version__, "python": platform.python_version(), **_commit()}
     write_atomic(run_dir / "versions.json", json.dumps(versions, indent=2) + "\n")
     write_atomic(path, yaml.safe_dump(dict(settings), sort_keys=False))
 
@@ -102,6 +103,19 @@ def read_versions(run_dir: Path) -> dict[str, str]:
         return json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise DataError(path, None, f"not the versions of a run ({error})") from error
+
+
+def _commit() -> dict[str, str]:
+    """The commit of the code, if it runs from a clone; ``-dirty`` marks changes to it."""
+    root = Path(__file__).resolve().parents[1]
+    if not (root / ".git").exists():  # git would find a clone around an installed package
+        return {}
+    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--exclude=*"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return {}
+    return {"commit": done.stdout.strip()}
 
 
 def _version(package: str) -> str | None:
