@@ -153,7 +153,7 @@ def command_of(settings: Mapping[str, Any]) -> tuple[str, str]:
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Settings that decide results, by their dotted names."""
     for key, value in settings.items():
-        if not prefix and key in (*FREE_TO_CHANGE, "base", "preset", "ablation"):
+        if not prefix and key in FREE_TO_CHANGE:
             continue
         if isinstance(value, Mapping):
             yield from _flat(value, f"{prefix}{key}.")

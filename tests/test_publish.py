@@ -96,6 +96,7 @@ def test_a_folder_becomes_rows(publish: Any, tmp_path: Path) -> None:
     publish.publish(publish.Settings(check=True, docs=str(docs)))
 
 
+@pytest.mark.slow
 def test_publishing_again_changes_nothing(publish: Any, tmp_path: Path) -> None:
     runs = [str(make_folder(tmp_path / str(s), "preset=paper", seed=s)) for s in (1, 2)]
     docs = tmp_path / "docs"
@@ -180,6 +181,7 @@ def test_episodes_of_another_seed_are_refused(publish: Any, tmp_path: Path) -> N
         publish.publish(publish.Settings(runs=[str(run_dir)], docs=str(tmp_path / "docs")))
 
 
+@pytest.mark.slow
 def test_the_check_exits_with_one_line_when_a_number_was_changed(tmp_path: Path) -> None:
     docs = tmp_path / "docs"
     with initialize_config_dir(str(RECIPES / "config"), version_base="1.3"):
