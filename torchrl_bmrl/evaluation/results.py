@@ -17,7 +17,16 @@ from torchrl_bmrl.evaluation.statistics import bootstrap_interval
 from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.names import TASKS
 
-POLICIES: tuple[str, ...] = ("expert", "bcq", "distilled")
+POLICIES: tuple[str, ...] = (
+    "expert",
+    "bcq",
+    "distilled",
+    "bc",
+    "td3_bc",
+    "iql",
+    "cql",
+    "bcq_one_hot",
+)
 """The policies that a run compares, in the order of the tables."""
 
 RESULT_FIELDS: tuple[str, ...] = (

@@ -16,7 +16,16 @@ from torchrl_bmrl.reports import paper
 MISSING = "–"
 """Cell of a number that was not measured."""
 
-_POLICY_NAMES = {"expert": "Expert", "bcq": "BCQ", "distilled": "Distilled"}
+_POLICY_NAMES = {
+    "expert": "Expert",
+    "bcq": "BCQ",
+    "distilled": "Distilled",
+    "bc": "BC",
+    "td3_bc": "TD3+BC",
+    "iql": "IQL",
+    "cql": "CQL",
+    "bcq_one_hot": "BCQ, one-hot task",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +95,16 @@ def task_name(task: str) -> str:
         'Push Left'
     """
     return task.replace("_", " ").title()
+
+
+def policy_name(policy: str) -> str:
+    """A policy's name as the tables print it.
+
+    Example:
+        >>> policy_name("td3_bc")
+        'TD3+BC'
+    """
+    return _POLICY_NAMES[policy]
 
 
 def results_table(summaries: Sequence[Summary]) -> Table:
