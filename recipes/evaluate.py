@@ -11,6 +11,7 @@ import os
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ import torch
 from omegaconf import DictConfig
 from settings import Config, run_recipe
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.transforms import Transform
 
 from torchrl_bmrl.agents import Student, load_bcq_loss, load_student
 from torchrl_bmrl.checkpoint import load_checkpoint
@@ -45,35 +48,31 @@ from torchrl_bmrl.reports.films import explore_demonstrations
 from torchrl_bmrl.runs import read_versions
 
 
-def evaluate_job(job: tuple[Config, str, str, str], report: Report) -> list[ResultRow]:
-    """All episodes of one task, policy and source of m; kept at once, read back if there."""
-    config, task, policy_name, source = job
-    run_dir, episodes = Path(config.run_dir), config.evaluate.episodes
-    options = {"num_envs": episodes, "stepper": config.stepper}
-    path = run_dir / "evaluation" / ("-".join(filter(None, (task, policy_name, source))) + ".csv")
+def keep_rows(
+    config: Config,
+    task: str,
+    policy_name: str,
+    outcomes: Callable[[list[int]], list[EpisodeOutcome]],
+    *,
+    source: str = "",
+    report: Report,
+) -> list[ResultRow]:
+    """The evaluation's episodes of one task, policy and source of m; kept, read back if there.
+
+    Args:
+        config: of the run.
+        task: whose episodes.
+        policy_name: one of :data:`torchrl_bmrl.evaluation.POLICIES`.
+        outcomes: plays episodes that start with these seeds.
+        source: of m, for the distilled policy.
+        report: called with the number of steps where the episodes are read back.
+    """
+    name = "-".join(filter(None, (task, policy_name, source)))
+    path = Path(config.run_dir) / "evaluation" / f"{name}.csv"
     if path.exists():
-        report(episodes * HORIZON)
+        report(config.evaluate.episodes * HORIZON)
         return read_results(path)
-    seeds = [derive_seed(config.seed, "evaluate", task, i) for i in range(episodes)]
-    if policy_name == "expert":
-        outcomes = expert_outcomes(config, task, seeds)
-        report(episodes * HORIZON)
-    elif policy_name == "bcq":
-        loss, metadata = load_bcq_loss(run_dir / "bcq" / task / "checkpoint.safetensors")
-        policy = BCQPolicy.from_loss(loss, num_candidates=config.evaluate.num_candidates)
-        with closing(make_env(task, read_statistics(run_dir / "data"), **options)) as env:
-            outcomes = evaluate_policy(env, policy, seeds, report=report)
-    else:
-        student, metadata = load_student(student_path(config))
-        policy = student.policy(
-            num_candidates=config.evaluate.num_candidates, latent_clip=metadata["latent_clip"]
-        )
-        statistics = ObservationStatistics.from_lists(metadata["statistics"])
-        index = metadata["tasks"].index(task)
-        demonstration = held_out_episode(config, task, index, statistics)
-        transform = student.task_latent_source(source, index, demonstration)
-        with closing(make_env(task, statistics, transform, **options)) as env:
-            outcomes = evaluate_policy(env, policy, seeds, report=report)
+    seeds = [derive_seed(config.seed, "evaluate", task, i) for i in range(config.evaluate.episodes)]
     rows = [
         ResultRow(
             task=task,
@@ -84,7 +83,7 @@ def evaluate_job(job: tuple[Config, str, str, str], report: Report) -> list[Resu
             episode_return=outcome.episode_return,
             success=outcome.success,
         )
-        for i, outcome in enumerate(outcomes)
+        for i, outcome in enumerate(outcomes(seeds))
     ]
     write_results(path, rows)
     return rows
@@ -108,6 +107,49 @@ def held_out_episode(
         Path(config.run_dir) / "data", task, statistics, split="valid", num_task=index
     )
     return data[data["episode"] == 0]
+
+
+def play(
+    config: Config,
+    task: str,
+    policy: TensorDictModuleBase,
+    *transforms: Transform,
+    statistics: ObservationStatistics,
+    seeds: list[int],
+    report: Report,
+) -> list[EpisodeOutcome]:
+    """Episodes of a policy, all at once, in an environment with these further transforms."""
+    options = {"num_envs": len(seeds), "stepper": config.stepper}
+    with closing(make_env(task, statistics, *transforms, **options)) as env:
+        return evaluate_policy(env, policy, seeds, report=report)
+
+
+def evaluate_job(job: tuple[Config, str, str, str], report: Report) -> list[ResultRow]:
+    """All episodes of one task, policy and source of m; kept at once, read back if there."""
+    config, task, policy_name, source = job
+    run_dir, count = Path(config.run_dir), config.evaluate.num_candidates
+
+    def outcomes(seeds: list[int]) -> list[EpisodeOutcome]:
+        if policy_name == "expert":
+            played = expert_outcomes(config, task, seeds)
+            report(len(seeds) * HORIZON)
+            return played
+        if policy_name == "bcq":
+            loss, _ = load_bcq_loss(run_dir / "bcq" / task / "checkpoint.safetensors")
+            policy = BCQPolicy.from_loss(loss, num_candidates=count)
+            statistics = read_statistics(run_dir / "data")
+            return play(config, task, policy, statistics=statistics, seeds=seeds, report=report)
+        student, metadata = load_student(student_path(config))
+        policy = student.policy(num_candidates=count, latent_clip=metadata["latent_clip"])
+        statistics = ObservationStatistics.from_lists(metadata["statistics"])
+        index = metadata["tasks"].index(task)
+        demonstration = held_out_episode(config, task, index, statistics)
+        transform = student.task_latent_source(source, index, demonstration)
+        return play(
+            config, task, policy, transform, statistics=statistics, seeds=seeds, report=report
+        )
+
+    return keep_rows(config, task, policy_name, outcomes, source=source, report=report)
 
 
 def expert_outcomes(config: Config, task: str, seeds: list[int]) -> list[EpisodeOutcome]:

@@ -20,7 +20,6 @@ import importlib
 import statistics
 import sys
 import time
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -29,16 +28,12 @@ from typing import Any
 import gymnasium
 import hydra
 import torch
+from algorithms import bc, bcq, ddpg, iql, make_actor, make_critics, plas, td3_bc
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import (
-    AddStateIndependentNormalScale,
-    TensorDictModule,
-    TensorDictModuleBase,
-    TensorDictSequential,
-)
-from torch import Tensor, nn
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import (
@@ -52,22 +47,13 @@ from torchrl.envs import (
     TransformedEnv,
 )
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import AdditiveGaussianModule, IndependentNormal, ProbabilisticActor
-from torchrl.objectives import BCLoss, DDPGLoss, IQLLoss, LossModule, SoftUpdate, TD3BCLoss, TD3Loss
+from torchrl.modules import AdditiveGaussianModule
+from torchrl.objectives import LossModule, SoftUpdate, TD3Loss
 
 from torchrl_bmrl.checkpoint import load_checkpoint, save_checkpoint
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
 from torchrl_bmrl.files import write_atomic, write_rows
-from torchrl_bmrl.modules import (
-    ActionVAE,
-    BCQPolicy,
-    PLASPolicy,
-    make_latent_actor,
-    make_qvalue_network,
-)
-from torchrl_bmrl.modules.generator import make_mlp
-from torchrl_bmrl.objectives import BCQLoss, PLASLoss
 from torchrl_bmrl.parallel import Report, available_cores, derive_seed, run_jobs
 from torchrl_bmrl.runs import check_finite, open_run
 
@@ -93,71 +79,7 @@ class Settings:
     eval_episodes: int = 5  # of each trained policy
 
 
-# -- offline algorithms: from the sizes of observation and action to a loss and its policy ---------
-
-Algorithm = tuple[LossModule, Callable[[], TensorDictModuleBase]]
-BOUNDS = (-1.0, 1.0)  # the environment scales the actions
-CELLS = (256, 256)  # of every network
-
-
-def make_actor(observation_dim: int, action_dim: int) -> TensorDictModule:
-    """Deterministic policy."""
-    network = nn.Sequential(make_mlp(observation_dim, action_dim, CELLS), nn.Tanh())
-    return TensorDictModule(network, in_keys=["observation"], out_keys=["action"])
-
-
-def make_critics(observation_dim: int, action_dim: int) -> list[TensorDictModule]:
-    """Twin critics."""
-    return [make_qvalue_network(observation_dim, action_dim, num_cells=CELLS) for _ in range(2)]
-
-
-def ddpg(*dims: int) -> Algorithm:
-    """Off-policy: nothing keeps its actions near the batch."""
-    actor = make_actor(*dims)
-    return DDPGLoss(actor, make_critics(*dims)[0], delay_actor=True), lambda: actor
-
-
-def bc(*dims: int) -> Algorithm:
-    """Imitation."""
-    # TorchRL's BCLoss has no targets and does not say so.
-    warnings.filterwarnings("ignore", "The name target_actor_network_params wasn't part of")
-    actor = make_actor(*dims)
-    return BCLoss(actor), lambda: actor
-
-
-def td3_bc(*dims: int) -> Algorithm:
-    """TD3 with an imitation term."""
-    actor = make_actor(*dims)
-    loss = TD3BCLoss(actor, make_critics(*dims), bounds=BOUNDS, loss_function="l2")
-    return loss, lambda: actor
-
-
-def iql(*dims: int) -> Algorithm:
-    """Expectile values and advantage-weighted imitation, with the published coefficients."""
-    network = nn.Sequential(make_actor(*dims).module, AddStateIndependentNormalScale(dims[1]))
-    keys = ["loc", "scale"]
-    network = TensorDictModule(network, in_keys=["observation"], out_keys=keys)
-    actor = ProbabilisticActor(network, in_keys=keys, distribution_class=IndependentNormal)
-    value = make_mlp(dims[0], 1, CELLS)
-    value = TensorDictModule(value, in_keys=["observation"], out_keys=["state_value"])
-    options = {"temperature": 3.0, "expectile": 0.7, "loss_function": "l2"}
-    return IQLLoss(actor, make_critics(*dims), value, **options), lambda: actor
-
-
-def plas(*dims: int) -> Algorithm:
-    """A policy that chooses the latent of a generator of the batch's actions."""
-    generator = ActionVAE(*dims, num_cells=CELLS)
-    # Published: 2. BCQ's 0.5 keeps to latents that so short a training has seen.
-    actor = make_latent_actor(dims[0], generator.latent_dim, num_cells=CELLS, max_latent=0.5)
-    loss = PLASLoss(generator, actor, make_critics(*dims), bounds=BOUNDS)
-    return loss, lambda: PLASPolicy.from_loss(loss)
-
-
-def bcq(*dims: int) -> Algorithm:
-    """The best of what a generator of the batch's actions proposes."""
-    loss = BCQLoss(ActionVAE(*dims, num_cells=CELLS), make_critics(*dims), bounds=BOUNDS)
-    return loss, lambda: BCQPolicy.from_loss(loss)
-
+# -- offline algorithms --------------------------------------------------------------------------
 
 ALGORITHMS = {build.__name__: build for build in (ddpg, bc, td3_bc, iql, plas, bcq)}
 WARMUP = {"plas": 0.3}  # first share of the updates: the generator alone, held afterwards

@@ -23,6 +23,8 @@ from torchrl_bmrl.objectives.generative import KL_REDUCTIONS
 from torchrl_bmrl.parallel import available_cores
 from torchrl_bmrl.runs import LOGGERS, open_run
 
+BASELINES = ("bc", "td3_bc", "iql", "cql", "bcq_one_hot")
+
 
 @dataclass
 class CollectSettings:
@@ -148,6 +150,14 @@ class LatentSACSettings:
 
 
 @dataclass
+class BaselineSettings:
+    """Other offline algorithms on the same demonstrations (baselines.py)."""
+
+    algorithms: list[str] = field(default_factory=lambda: list(BASELINES))
+    updates: int | None = None  # of each; null: as many as an agent of stage 1
+
+
+@dataclass
 class Config:
     """Everything that decides a run; ``config.yaml`` in the run folder is one of these."""
 
@@ -173,6 +183,7 @@ class Config:
     imitate: ImitateSettings = field(default_factory=ImitateSettings)
     interpolation: InterpolationSettings = field(default_factory=InterpolationSettings)
     latent_sac: LatentSACSettings = field(default_factory=LatentSACSettings)
+    baselines: BaselineSettings = field(default_factory=BaselineSettings)
 
 
 POSITIVE = (
@@ -290,6 +301,14 @@ def check_settings(config: Config) -> None:
         raise ConfigError(f"latent_sac.seeds is {seeds}; valid: at least one, each once")
     if not 0 <= steps <= config.latent_sac.environment_steps:
         raise ConfigError(f"latent_sac.random_steps is {steps}; valid: 0 to environment_steps")
+    names, updates = config.baselines.algorithms, config.baselines.updates
+    for name in names:
+        if name not in BASELINES:
+            raise UnknownNameError("baseline", name, BASELINES)
+    if not names or len(set(names)) < len(names):
+        raise ConfigError(f"baselines.algorithms is {names}; valid: at least one, each once")
+    if updates is not None and updates < 1:
+        raise ConfigError(f"baselines.updates is {updates}; valid: above 0, or null")
     if config.collect.valid_episodes < 1 or min(config.collect.train_episodes.values()) < 1:
         raise ConfigError("collect.train_episodes and collect.valid_episodes; valid: at least 1")
 

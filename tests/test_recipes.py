@@ -153,6 +153,9 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
         ("latent_sac.hold=0", "latent_sac.hold is 0"),
         ("latent_sac.seeds=[1,1]", r"latent_sac.seeds is \[1, 1\]; valid: at least one, each once"),
         ("latent_sac.random_steps=-1", "latent_sac.random_steps is -1; valid: 0 to"),
+        ("baselines.algorithms=[ddpg]", "unknown baseline 'ddpg'; .*td3_bc, iql, cql, bcq_one_hot"),
+        ("baselines.algorithms=[bc,bc]", r"baselines.algorithms is .*; valid: .*each once"),
+        ("baselines.updates=0", "baselines.updates is 0; valid: above 0, or null"),
     ],
 )
 def test_every_stage_is_checked_before_the_first_one_starts(

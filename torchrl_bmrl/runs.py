@@ -30,6 +30,7 @@ FREE_TO_CHANGE = (
     "imitate",
     "interpolation",
     "latent_sac",
+    "baselines",
 )
 """Settings that do not change a run's result, and so may differ when it goes on.
 
