@@ -121,7 +121,9 @@ def train_student(config: Config, report: Report) -> None:
         set_rng_state(state["rng"], config.device)
         done = metadata["updates"]
         report(done)
-    logger = make_logger(config.logger, run_dir, "distill") if done < settings.updates else None
+        if done == settings.updates:
+            return
+    logger = make_logger(config.logger, run_dir, "distill")
 
     def step(batch: TensorDictBase) -> dict[str, Tensor]:
         losses = loss(batch)

@@ -95,11 +95,27 @@ def train_agents(
     Raises:
         BMRLError: naming the agents that diverged, after the others are trained.
     """
-    settings = config.bcq
-    total = settings.epochs * settings.updates_per_epoch
     keep_freed_memory()
     kept = Agents(config, agents, statistics)
     kept.load()
+    if kept.updates:
+        report(kept.updates * len(agents))
+    if kept.updates < config.bcq.epochs * config.bcq.updates_per_epoch:
+        train_on(config, kept, buffer, statistics, report)
+    if kept.diverged:
+        raise BMRLError("; ".join(kept.diverged.values()))
+
+
+def train_on(
+    config: Config,
+    kept: Agents,
+    buffer: ReplayBuffer,
+    statistics: ObservationStatistics,
+    report: Report,
+) -> None:
+    """Updates from the last one kept to the end, with rollouts after every epoch."""
+    settings, agents = config.bcq, kept.agents
+    total = settings.epochs * settings.updates_per_epoch
 
     def accelerated(*networks: str) -> Update:
         chosen = {name: kept.optimizers[name] for name in networks}
@@ -110,13 +126,8 @@ def train_agents(
 
     update_all = accelerated(*kept.optimizers)
     warm_up = accelerated("generator") if settings.generator_warmup else update_all
-    if kept.updates:
-        report(kept.updates * len(agents))
-    loggers = {}
-    if kept.updates < total:
-        run_dir = Path(config.run_dir)
-        loggers = {name: make_logger(config.logger, run_dir, f"bcq_{name}") for name in agents}
-
+    run_dir = Path(config.run_dir)
+    loggers = {name: make_logger(config.logger, run_dir, f"bcq_{name}") for name in agents}
     for update in range(kept.updates + 1, total + 1):
         batch = buffer.sample().select(*kept.loss.in_keys)
         metrics = (warm_up if update <= settings.generator_warmup else update_all)(batch)
@@ -134,8 +145,6 @@ def train_agents(
                 write_rows(kept.folder / name / "evaluations.csv", rows)
         if saving:
             kept.save(update)
-    if kept.diverged:
-        raise BMRLError("; ".join(kept.diverged.values()))
 
 
 def evaluate_epoch(config, task, loss, statistics, epoch, update) -> list[dict]:
