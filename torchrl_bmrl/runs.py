@@ -20,6 +20,7 @@ from torchrl_bmrl.files import write_atomic
 FREE_TO_CHANGE = (
     "run_dir",
     "workers",
+    "only",
     "stepper",
     "logger",
     "imitate",
@@ -37,7 +38,8 @@ PACKAGES = ("torch", "torchrl", "tensordict", "robosuite", "mujoco", "gymnasium"
 def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
     """Creates a run folder, or checks that an existing one was told the same.
 
-    Writes ``config.yaml`` (everything that decides the run) and ``versions.json``.
+    Writes ``config.yaml`` (everything that decides the run) and ``versions.json``. Of several
+    processes that create it at once, one does and the others are checked.
 
     Args:
         run_dir: the folder.
@@ -56,21 +58,20 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
         torchrl_bmrl.errors.ConfigError: ...: seed is 1 here and 0 in the folder's run; ...
     """
     path = run_dir / "config.yaml"
-    if path.exists():
-        before = dict(_flat(read_settings(run_dir)))
-        now = dict(_flat(settings))
-        for key in sorted(before | now):
-            if key.split(".")[0] in FREE_TO_CHANGE or before.get(key) == now.get(key):
-                continue
-            raise ConfigError(
-                f"{run_dir}: {key} is {now.get(key)} here and {before.get(key)} in the folder's "
-                "run; give the same settings to go on, or another run_dir"
-            )
-        return
-    versions = {name: _version(name) for name in PACKAGES}
-    versions |= {"torchrl_bmrl": __version__, "python": platform.python_version()}
-    write_atomic(run_dir / "versions.json", json.dumps(versions, indent=2) + "\n")
-    write_atomic(path, yaml.safe_dump(dict(settings), sort_keys=False))
+    if not path.exists():
+        versions = {name: _version(name) for name in PACKAGES}
+        versions |= {"torchrl_bmrl": __version__, "python": platform.python_version()}
+        write_atomic(run_dir / "versions.json", json.dumps(versions, indent=2) + "\n")
+        write_atomic(path, yaml.safe_dump(dict(settings), sort_keys=False), replace=False)
+    before = dict(_flat(read_settings(run_dir)))
+    now = dict(_flat(settings))
+    for key in sorted(before | now):
+        if key.split(".")[0] in FREE_TO_CHANGE or before.get(key) == now.get(key):
+            continue
+        raise ConfigError(
+            f"{run_dir}: {key} is {now.get(key)} here and {before.get(key)} in the folder's "
+            "run; give the same settings to go on, or another run_dir"
+        )
 
 
 def read_settings(run_dir: Path) -> dict[str, Any]:
