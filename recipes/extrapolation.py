@@ -321,23 +321,10 @@ def check_settings(settings: Settings) -> None:
         )
 
 
-store = ConfigStore.instance()
-store.store(name="extrapolation_schema", node=Settings)
-store.store(
-    name="extrapolation",
-    node={
-        "defaults": [
-            "extrapolation_schema",
-            "_self_",
-            {"override hydra/hydra_logging": "disabled"},
-            {"override hydra/job_logging": "disabled"},
-        ],
-        "hydra": {"output_subdir": None, "run": {"dir": "."}},  # the run folder holds the settings
-    },
-)
+ConfigStore.instance().store(name="extrapolation_schema", node=Settings)
 
 
-@hydra.main(version_base="1.3", config_path=None, config_name="extrapolation")
+@hydra.main(version_base="1.3", config_path="config", config_name="extrapolation")
 def main(config: DictConfig) -> None:
     """Command line; an expected error becomes one line and exit code 1."""
     try:
@@ -347,7 +334,7 @@ def main(config: DictConfig) -> None:
         extrapolation(settings)
     except BMRLError as error:
         print(f"error: {error}", file=sys.stderr)
-        sys.exit(1)
+        raise SystemExit(1) from error
 
 
 if __name__ == "__main__":

@@ -167,6 +167,7 @@ class Config:
     run_dir: str = "runs/${hydra:job.name}-${name:${preset},${ablation}}-seed${seed}"
     base: str | None = None  # a run's folder: what this run would make again is taken from there
     tasks: list[str] = field(default_factory=lambda: list(TASKS))
+    only: list[str] | None = None  # tasks of this job of train_bcq.py; other jobs train the others
     workers: int = field(default_factory=available_cores)  # processes; no result depends on them
     stepper: str = "fast"  # or robosuite, four times slower; no result depends on it
     device: str = "cpu"  # that trains; episodes are played on the CPU
@@ -243,6 +244,11 @@ def check_settings(config: Config) -> None:
             f"tasks is {config.tasks}; valid: at least one, each once and with a number in "
             "collect.train_episodes"
         )
+    if (only := config.only) is not None:
+        if not only or not set(only) <= set(config.tasks) or len(set(only)) < len(only):
+            raise ConfigError(f"only is {only}; valid: some of {config.tasks}, each once")
+        if config.bcq.stacked:
+            raise ConfigError(f"only is {only}; valid: null with bcq.stacked, which is one program")
     for task, befores in config.collect.after.items():
         check_task(task)
         for before in filter(None, befores):
@@ -313,16 +319,26 @@ def check_settings(config: Config) -> None:
         raise ConfigError("collect.train_episodes and collect.valid_episodes; valid: at least 1")
 
 
-def run_recipe(settings: DictConfig, run: Callable[[Config], None]) -> None:
-    """Runs a recipe in its run folder; an expected error becomes one line and exit code 1."""
+def run_recipe(
+    settings: DictConfig, run: Callable[[Config], None], *, splits: bool = False
+) -> None:
+    """Runs a recipe in its run folder; an expected error becomes one line and exit code 1.
+
+    Args:
+        settings: what the command line and the preset say.
+        run: the recipe.
+        splits: it does the tasks of ``only`` and leaves the others to other jobs.
+    """
     try:
         config = OmegaConf.to_object(settings)
         check_settings(config)
+        if config.only is not None and not splits:
+            raise ConfigError(f"only is {config.only}; valid: null, except with train_bcq.py")
         open_run(Path(config.run_dir), OmegaConf.to_container(settings, resolve=True))
         run(config)
     except BMRLError as error:
         print(f"error: {error}", file=sys.stderr)
-        sys.exit(1)
+        raise SystemExit(1) from error
 
 
 OmegaConf.register_new_resolver(

@@ -2,6 +2,7 @@
 
 python recipes/train_bcq.py run_dir=runs/mine           # after recipes/collect.py
 python recipes/train_bcq.py preset=smoke tasks=[lift]
+python recipes/train_bcq.py --multirun run_dir=runs/mine workers=1 only=[reach],[lift]
 python recipes/train_bcq.py run_dir=runs/mine device=cuda bcq.stacked=true cudagraphs=true
 """
 
@@ -168,11 +169,14 @@ def evaluate_epoch(config, task, loss, statistics, epoch, update) -> list[dict]:
 
 
 def train_all(config: Config) -> None:
-    """Trains every task's agents: one process each, or all of them stacked in this one."""
+    """Trains the agents of every task or of ``only`` some.
+
+    They get one process each, or are all stacked in this one.
+    """
     agents = {
         task if seed == 0 else f"{task}-{seed}": task
         for seed in range(config.bcq.seeds)
-        for task in config.tasks
+        for task in config.only or config.tasks
     }
     stacked = config.bcq.stacked and len(agents) > 1
     jobs = [agents] if stacked else [{name: task} for name, task in agents.items()]
@@ -189,7 +193,7 @@ def train_all(config: Config) -> None:
 @hydra.main(version_base="1.3", config_path="config", config_name="recipe")
 def main(config: DictConfig) -> None:
     """Command line."""
-    run_recipe(config, train_all)
+    run_recipe(config, train_all, splits=True)
 
 
 if __name__ == "__main__":

@@ -101,7 +101,7 @@ def test_an_invalid_setting_is_one_line_that_says_what_is_valid(
     from hydra import compose, initialize
     from omegaconf import OmegaConf
 
-    with initialize(version_base="1.3", config_path=None):
+    with initialize(version_base="1.3", config_path="../recipes/config"):
         config = compose("extrapolation", overrides=[*SMALL, override])
     with pytest.raises(extrapolation.BMRLError, match=f"^{says}") as error:
         extrapolation.check_settings(OmegaConf.to_object(config))

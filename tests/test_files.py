@@ -62,6 +62,23 @@ def test_a_block_that_writes_nothing_fails_and_keeps_the_old_file(tmp_path: Path
     assert (tmp_path / "file").read_text() == "old"
 
 
+@pytest.mark.parametrize("links", [True, False], ids=["links", "no links"])
+def test_the_first_of_two_writers_stays_where_the_second_does_not_replace(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool
+) -> None:
+    def refuse(source: Path, target: Path) -> None:
+        raise PermissionError("a file system without links")
+
+    if not links:
+        monkeypatch.setattr("os.link", refuse)
+    write_atomic(tmp_path / "file", "first", replace=False)
+    assert (tmp_path / "file").read_text() == "first"
+    write_atomic(tmp_path / "file", "second", replace=False)
+    # Without links it falls back on replacing.
+    assert (tmp_path / "file").read_text() == ("first" if links else "second")
+    assert names(tmp_path) == ["file"]
+
+
 def test_two_writers_of_one_path_do_not_share_a_temporary(tmp_path: Path) -> None:
     with atomic_path(tmp_path / "file") as first, atomic_path(tmp_path / "file") as second:
         assert first != second

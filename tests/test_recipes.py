@@ -121,6 +121,9 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
     [
         ("tasks=[]", r"tasks is \[\]"),
         ("tasks=[lift,lift]", "each once"),
+        ("only=[]", r"only is \[\]; valid: some of .'reach', 'lift'"),
+        ("only=[lift,lift]", "only is .'lift', 'lift'.; valid: .*each once"),
+        ("only=[lfit]", "only is .'lfit'.; valid: some of .'reach', 'lift'"),
         ("+collect.train_episodes.lfit=1", "unknown task 'lfit'"),
         ("collect.train_episodes.lift=0", "collect.train_episodes"),
         ("collect.valid_episodes=0", "collect.valid_episodes"),
@@ -142,6 +145,7 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
         ("workers=0", "workers is 0"),
         ("bcq.lr=0", "bcq.lr is 0"),
         ("bcq.seeds=0", "bcq.seeds is 0"),
+        (("only=[lift]", "bcq.stacked=true"), "only is .*; valid: null with bcq.stacked"),
         ("bcq.target_dtype=float8", "bcq.target_dtype 'float8'; .*None, bfloat16"),
         ("device=gpu", "device is 'gpu'; valid: one that torch can use"),
         ("bcq.eval_episodes=0", "bcq.eval_episodes is 0"),
@@ -159,9 +163,10 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
     ],
 )
 def test_every_stage_is_checked_before_the_first_one_starts(
-    recipes: Any, tmp_path: Path, override: str, says: str
+    recipes: Any, tmp_path: Path, override: str | tuple[str, ...], says: str
 ) -> None:
-    config = OmegaConf.to_object(configured("preset=smoke", f"run_dir={tmp_path}", override))
+    overrides = [override] if isinstance(override, str) else override
+    config = OmegaConf.to_object(configured("preset=smoke", f"run_dir={tmp_path}", *overrides))
     with pytest.raises(BMRLError, match=says):
         recipes.check_settings(config)
 

@@ -15,7 +15,9 @@ import torch
 
 pytest.importorskip("yaml")
 
-from torchrl_bmrl import __version__
+import yaml
+
+from torchrl_bmrl import __version__, runs
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
 from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.runs import (
@@ -69,7 +71,9 @@ def test_a_new_folder_says_what_it_was_told_and_on_what_it_runs(tmp_path: Path) 
     assert {"python", "torchrl", "tensordict"} <= versions.keys()
 
 
-@pytest.mark.parametrize("key", ["run_dir", "workers", "logger", "base", "preset", "ablation"])
+@pytest.mark.parametrize(
+    "key", ["run_dir", "workers", "logger", "only", "base", "preset", "ablation"]
+)
 def test_a_run_goes_on_with_the_same_settings_and_what_is_free_to_change(
     tmp_path: Path, key: str
 ) -> None:
@@ -197,6 +201,23 @@ def test_other_settings_are_refused_by_the_key_that_differs(
     assert message in str(info.value)
     assert str(tmp_path) in str(info.value)
     assert contents(tmp_path) == before
+
+
+def test_of_two_runs_that_create_a_folder_at_once_one_does_and_the_other_is_checked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = runs.write_atomic
+
+    def while_another_is_faster(path: Path, text: str, **options: Any) -> None:
+        if path.name == "config.yaml":
+            write(path, yaml.safe_dump(SETTINGS))
+        write(path, text, **options)
+
+    monkeypatch.setattr(runs, "write_atomic", while_another_is_faster)
+    open_run(tmp_path / "same", changed("workers", 2))
+    with pytest.raises(ConfigError, match="seed is 1 here and 0 in"):
+        open_run(tmp_path / "other", changed("seed", 1))
+    assert read_settings(tmp_path / "other") == SETTINGS
 
 
 @pytest.mark.parametrize("text", [None, "a: [1", "- 1\n- 2\n", ""])

@@ -17,7 +17,7 @@ from torchrl_bmrl.errors import DataError
 
 
 @contextmanager
-def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_path(path: str | os.PathLike[str], *, replace: bool = True) -> Iterator[Path]:
     """Yields a temporary path that becomes ``path`` when the block succeeds.
 
     The temporary file lies in the same folder (created if missing), so that the final rename is
@@ -27,6 +27,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     Args:
         path: The file to write or replace.
+        replace: ``False`` keeps a file that is there by then, another process's.
 
     Yields:
         Path to write to; the block must create the file and close it.
@@ -47,18 +48,32 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         with temporary.open("r+b") as file:
             # Without it a power cut after the rename may leave an empty file under the final name.
             os.fsync(file.fileno())
-        os.replace(temporary, path)
+        if replace or not _link(temporary, path):
+            os.replace(temporary, path)
     except BaseException:  # an interrupt must not leave the temporary file either
         temporary.unlink(missing_ok=True)
         raise
 
 
-def write_atomic(path: str | os.PathLike[str], data: str | bytes) -> None:
+def _link(temporary: Path, path: Path) -> bool:
+    """Gives a file a second name unless that is taken; ``False`` where there are no links."""
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        pass
+    except OSError:
+        return False
+    temporary.unlink()
+    return True
+
+
+def write_atomic(path: str | os.PathLike[str], data: str | bytes, *, replace: bool = True) -> None:
     r"""Writes a whole file, or leaves the old one.
 
     Args:
         path: The file to write or replace; its folder is created if missing.
         data: The content; text is written as UTF-8, line ends as they are.
+        replace: ``False`` keeps a file that is there by then, another process's.
 
     Example:
         >>> import tempfile
@@ -67,7 +82,7 @@ def write_atomic(path: str | os.PathLike[str], data: str | bytes) -> None:
         >>> file.read_bytes()
         b'good\n'
     """
-    with atomic_path(path) as temporary:
+    with atomic_path(path, replace=replace) as temporary:
         temporary.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
 
 

@@ -25,6 +25,7 @@ FREE_TO_CHANGE = (
     "preset",
     "ablation",
     "workers",
+    "only",
     "stepper",
     "logger",
     "imitate",
@@ -55,7 +56,8 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
 
     Writes ``config.yaml`` (everything that decides the run) and ``versions.json``. With ``base``
     among the settings, another run's folder, a new run begins with those files of it that it would
-    only make again (:data:`ADOPTED`).
+    only make again (:data:`ADOPTED`). Of several processes that create a folder at once, one does
+    and the others are checked.
 
     Args:
         run_dir: the folder.
@@ -75,25 +77,24 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
         torchrl_bmrl.errors.ConfigError: ...: seed is 1 here and 0 in the folder's run; ...
     """
     path = run_dir / "config.yaml"
-    if path.exists():
-        before = dict(_flat(read_settings(run_dir)))
-        now = dict(_flat(settings))
-        for key in sorted(before | now):
-            if key.split(".")[0] in FREE_TO_CHANGE or before.get(key) == now.get(key):
-                continue
-            raise ConfigError(
-                f"{run_dir}: {key} is {now.get(key)} here and {before.get(key)} in the folder's "
-                "run; give the same settings to go on, or another run_dir"
-            )
-        return
-    if settings.get("base"):
-        _adopt(run_dir, Path(settings["base"]), settings)
-    versions = {name: _version(name) for name in PACKAGES}
-    versions |= {"torchrl_bmrl": __version__, "python": platform.python_version()}
-    if commit := _commit():
-        versions["commit"] = commit
-    write_atomic(run_dir / "versions.json", json.dumps(versions, indent=2) + "\n")
-    write_atomic(path, yaml.safe_dump(dict(settings), sort_keys=False))
+    if not path.exists():
+        if settings.get("base"):
+            _adopt(run_dir, Path(settings["base"]), settings)
+        versions = {name: _version(name) for name in PACKAGES}
+        versions |= {"torchrl_bmrl": __version__, "python": platform.python_version()}
+        if commit := _commit():
+            versions["commit"] = commit
+        write_atomic(run_dir / "versions.json", json.dumps(versions, indent=2) + "\n")
+        write_atomic(path, yaml.safe_dump(dict(settings), sort_keys=False), replace=False)
+    before = dict(_flat(read_settings(run_dir)))
+    now = dict(_flat(settings))
+    for key in sorted(before | now):
+        if key.split(".")[0] in FREE_TO_CHANGE or before.get(key) == now.get(key):
+            continue
+        raise ConfigError(
+            f"{run_dir}: {key} is {now.get(key)} here and {before.get(key)} in the folder's "
+            "run; give the same settings to go on, or another run_dir"
+        )
 
 
 def _adopt(run_dir: Path, base: Path, settings: Mapping[str, Any]) -> None:
@@ -104,8 +105,9 @@ def _adopt(run_dir: Path, base: Path, settings: Mapping[str, Any]) -> None:
             continue
         for source in base.glob(pattern):
             target = run_dir / source.relative_to(base)
+            if target.exists():  # whole, from a start that was killed or another process
+                continue
             target.parent.mkdir(parents=True, exist_ok=True)
-            target.unlink(missing_ok=True)  # of a start that was killed
             try:
                 os.link(source, target)
             except OSError:  # on another disk

@@ -1,0 +1,211 @@
+"""Sweeps: the launchers give what single runs give, a job that fails stops no other."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("hydra")
+pytest.importorskip("gymnasium")
+pytest.importorskip("h5py")
+pytest.importorskip("safetensors")
+pytest.importorskip("scipy")
+pytest.importorskip("tqdm")
+
+import yaml
+from hydra import compose, initialize_config_dir
+
+from torchrl_bmrl.errors import ConfigError
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+SMALL = [
+    "preset=smoke",
+    "tasks=[reach,lift,push_up]",
+    *(f"collect.train_episodes.{task}=1" for task in ("reach", "lift", "push_up")),
+    "bcq.epochs=1",
+    "bcq.updates_per_epoch=6",
+    "bcq.batch_size=8",
+    "bcq.num_cells=[16,16]",
+    "evaluate.num_candidates=5",
+]
+REACH = ["preset=smoke", "tasks=[reach]", "collect.train_episodes.reach=1", "workers=1"]
+
+
+def sweep(name: str, *overrides: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Sweeps a recipe as a person would."""
+    return subprocess.run(
+        [sys.executable, str(RECIPES / f"{name}.py"), "--multirun", *overrides],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+
+
+def contents(folder: Path, pattern: str) -> dict[str, bytes]:
+    files = sorted(folder.glob(pattern))
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def beside() -> Iterator[None]:
+    """The recipes' modules, importable as they are for a script beside them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(RECIPES))
+        yield
+
+
+@pytest.fixture(scope="module")
+def run(beside: None) -> Callable[..., Path]:
+    """Runs a recipe's function alone, in this process."""
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    import settings
+
+    def run(folder: Path, function: Any, *overrides: str, **options: Any) -> Path:
+        with initialize_config_dir(version_base="1.3", config_dir=str(RECIPES / "config")):
+            config = compose("recipe", overrides=[*overrides, f"run_dir={folder}", "workers=1"])
+        settings.run_recipe(config, function, **options)
+        return folder
+
+    return run
+
+
+# -- what the launcher calls -----------------------------------------------------------------------
+
+
+def test_a_job_returns_what_went_wrong_and_starts_where_the_sweep_was_started(
+    beside: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hydra_plugins.reporting_sweeper import run_job
+
+    monkeypatch.chdir(tmp_path)  # puts the folder back afterwards
+    (tmp_path / "sweep").mkdir()
+
+    def well(config: Any) -> None:
+        Path("here").touch()
+
+    def expected(config: Any) -> None:
+        raise SystemExit(1) from ConfigError("seed is -1")
+
+    def unexpected(config: Any) -> None:
+        raise KeyError("robot")
+
+    assert run_job(well, str(tmp_path / "sweep"), {}) is None
+    assert (tmp_path / "sweep" / "here").exists()
+    assert run_job(expected, str(tmp_path), {}) == "error: seed is -1"
+    report = run_job(unexpected, str(tmp_path), {})
+    assert "in unexpected" in report
+    assert "KeyError: 'robot'" in report
+    assert "FileNotFoundError" in run_job(well, str(tmp_path / "elsewhere"), {})
+
+
+# -- sweeps ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def alone(run: Any, tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, bytes]]:
+    """The data of seeds 0 and 2, each collected by a run of its own."""
+    import collect
+
+    folders = [tmp_path_factory.mktemp("alone") for _ in range(2)]
+    for folder, seed in zip(folders, (0, 2), strict=True):
+        run(folder, collect.collect, *REACH, f"seed={seed}")
+    return [contents(folder, "data/**/*") for folder in folders]
+
+
+@pytest.fixture
+def cluster() -> Iterator[str]:
+    """Address of a Ray cluster of two nodes with one core each, which started elsewhere."""
+    utils = pytest.importorskip("ray.cluster_utils")
+    folder = tempfile.mkdtemp(prefix="ray-", dir="/tmp")  # sockets' paths must be short
+    options = {"num_cpus": 1, "include_dashboard": False, "temp_dir": folder}
+    nodes = utils.Cluster(initialize_head=True, head_node_args=options)
+    try:
+        nodes.add_node(num_cpus=1)
+        yield nodes.address
+    finally:
+        nodes.shutdown()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def check_sweep_of_three_seeds(cwd: Path, alone: list[dict[str, bytes]], *launcher: str) -> None:
+    """Seeds 0 and 2 give what they give alone; seed 1 finds its folder taken and is reported."""
+    taken = cwd / "runs" / "collect-smoke-seed1"
+    taken.mkdir(parents=True)
+    (taken / "config.yaml").write_text(yaml.safe_dump({"seed": 7}))
+    done = sweep("collect", *REACH, "seed=0,1,2", *launcher, cwd=cwd)
+    assert done.returncode == 1
+    _, message = done.stderr.split("1 of 3 jobs failed, the others are done:\n")
+    names, problem = message.splitlines()
+    assert set(REACH) | {"seed=1"} <= set(names.split())
+    assert problem.startswith("    error: runs/collect-smoke-seed1: ")
+    assert problem.endswith("give the same settings to go on, or another run_dir")
+    assert "Traceback" not in done.stderr
+    assert "Warning" not in done.stderr
+    for seed, expected in zip((0, 2), alone, strict=True):
+        assert len(expected) > 3
+        assert contents(cwd / "runs" / f"collect-smoke-seed{seed}", "data/**/*") == expected
+    assert [path.name for path in taken.iterdir()] == ["config.yaml"]
+    assert [path.name for path in cwd.iterdir()] == ["runs"]
+    assert [path.name for path in cwd.glob("runs/multirun/*/*")] == ["multirun.yaml"]
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_jobs_one_after_the_other_are_single_runs(alone: Any, tmp_path: Path) -> None:
+    check_sweep_of_three_seeds(tmp_path, alone)
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_jobs_in_processes_are_single_runs(alone: Any, tmp_path: Path) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    check_sweep_of_three_seeds(tmp_path, alone, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_jobs_on_a_cluster_are_single_runs(alone: Any, tmp_path: Path, cluster: str) -> None:
+    pytest.importorskip("hydra_plugins.hydra_ray_launcher")
+    address = f"hydra.launcher.ray.init.address='{cluster}'"
+    check_sweep_of_three_seeds(tmp_path, alone, "hydra/launcher=cluster", address)
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_agents_spread_over_jobs_are_those_of_one_run(run: Any, tmp_path: Path) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    import collect
+    import train_bcq
+
+    one = run(tmp_path / "one", collect.collect, *SMALL)
+    spread = tmp_path / "spread"
+    shutil.copytree(one / "data", spread / "data")
+    run(one, train_bcq.train_all, *SMALL)
+    # Two agents in a job: its workers are processes of a process.
+    options = ["run_dir=spread", "workers=2", "only=[reach,lift],[push_up]", "logger=none"]
+    launcher = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    done = sweep("train_bcq", *SMALL, *options, *launcher, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    expected = contents(one, "bcq/**/*")
+    assert len(expected) == 6
+    assert contents(spread, "bcq/**/*") == expected
+
+
+@pytest.mark.robosuite
+def test_a_recipe_that_does_not_split_refuses_only_some_tasks(
+    run: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import distill
+
+    with pytest.raises(SystemExit):
+        run(tmp_path / "run", distill.distill, *SMALL, "only=[reach]")
+    assert "error: only is ['reach']; valid: null, except with" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
