@@ -126,9 +126,17 @@ def cluster() -> Iterator[str]:
     utils = pytest.importorskip("ray.cluster_utils")
     folder = tempfile.mkdtemp(prefix="ray-", dir="/tmp")  # sockets' paths must be short
     options = {"num_cpus": 1, "include_dashboard": False, "temp_dir": folder}
-    nodes = utils.Cluster(initialize_head=True, head_node_args=options)
+    for left in reversed(range(3)):  # Ray gives a node 30 s to start, whatever else runs
+        nodes = utils.Cluster()
+        try:
+            nodes.add_node(**options)
+            nodes.add_node(num_cpus=1)
+            break
+        except Exception:
+            nodes.shutdown()
+            if not left:
+                raise
     try:
-        nodes.add_node(num_cpus=1)
         yield nodes.address
     finally:
         nodes.shutdown()
