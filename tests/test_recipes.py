@@ -381,22 +381,29 @@ def test_a_one_hot_student_learns_from_the_same_agents_and_acts(
     assert "The figures of the embedding are left out" in (folder / "report.html").read_text()
 
 
+@pytest.fixture(scope="module")
+def exported(run: Run, finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The finished run with its exported policy; the former stays as it is for others."""
+    import export
+
+    folder = shutil.copytree(finished, tmp_path_factory.mktemp("exported") / "run")
+    return run(folder, export.export)
+
+
 @pytest.mark.robosuite
 @pytest.mark.slow
 def test_an_exported_policy_acts_alone_as_it_does_in_its_run(
-    run: Run, finished: Path, tmp_path: Path
+    run: Run, exported: Path, tmp_path: Path
 ) -> None:
     import evaluate
-    import export
 
-    run(finished, export.export)
-    policy = shutil.copy(finished / "policy.safetensors", tmp_path)
+    policy = shutil.copy(exported / "policy.safetensors", tmp_path)
     alone = run(tmp_path / "alone", evaluate.evaluate, f"evaluate.policy={policy}")
-    distilled = [row for row in read_results(finished / "results.csv") if row.latent_source]
+    distilled = [row for row in read_results(exported / "results.csv") if row.latent_source]
     assert read_results(alone / "results.csv") == distilled
     assert not (alone / "data").exists()
     assert str(policy) in (alone / "report.html").read_text()
-    card = (finished / "policy.md").read_text()
+    card = (exported / "policy.md").read_text()
     assert "1 of reach, 1 of lift" in card
     assert "| Lift | Distilled | online |" in card
 
@@ -404,17 +411,15 @@ def test_an_exported_policy_acts_alone_as_it_does_in_its_run(
 @pytest.mark.robosuite
 @pytest.mark.slow
 def test_a_policy_is_refused_for_a_task_that_it_was_not_trained_on(
-    run: Run, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: Run, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     import evaluate
-    import export
 
-    run(finished, export.export)
     with pytest.raises(SystemExit, match="1"):
         run(
             tmp_path,
             evaluate.evaluate,
-            f"evaluate.policy={finished / 'policy.safetensors'}",
+            f"evaluate.policy={exported / 'policy.safetensors'}",
             "tasks=[reach,push_up]",
         )
     said = capsys.readouterr().err
