@@ -143,7 +143,9 @@ def evaluate_job(job: tuple[Config, str, str, str], report: Report) -> list[Resu
         policy = student.policy(num_candidates=count, latent_clip=metadata["latent_clip"])
         statistics = ObservationStatistics.from_lists(metadata["statistics"])
         index = metadata["tasks"].index(task)
-        demonstration = held_out_episode(config, task, index, statistics)
+        demonstration = None
+        if source == "demonstration":
+            demonstration = held_out_episode(config, task, index, statistics)
         transform = student.task_latent_source(source, index, demonstration)
         return play(
             config, task, policy, transform, statistics=statistics, seeds=seeds, report=report

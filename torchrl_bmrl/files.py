@@ -177,7 +177,6 @@ def read_rows(
     path = Path(path)
     if not path.is_file():
         raise DataError(path, None, f"no such file; expected a CSV with {', '.join(columns)}")
-    rows = []
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
         for column in columns:
@@ -185,21 +184,41 @@ def read_rows(
                 raise DataError(
                     path, column, f"column is missing; expected the columns {', '.join(columns)}"
                 )
-        for record in reader:
-            row = {}
-            for column, parse in columns.items():
-                text = record[column]
-                try:
-                    row[column] = parse(text or "")
-                except ValueError as error:
-                    found = "is missing" if text is None else f"is {text!r}"
-                    raise DataError(
-                        path,
-                        column,
-                        f"value in line {reader.line_num} {found}; expected {error}",
-                    ) from None
-            rows.append(row)
-    return rows
+        return [parse_row(record, columns, path, reader.line_num) for record in reader]
+
+
+def parse_row(
+    record: Mapping[str, str | None],
+    columns: Mapping[str, Callable[[str], Any]],
+    path: Path,
+    line: int,
+) -> dict[str, Any]:
+    """One line of a CSV file, each value through its column's parser.
+
+    Args:
+        record: The texts by column; ``None`` where the line is too short.
+        columns: As for :func:`read_rows`.
+        path: The file, for the message.
+        line: Number of the line in it, for the message.
+
+    Raises:
+        DataError: if a value is missing or not valid.
+
+    Example:
+        >>> parse_row({"epoch": "1", "seed": "0"}, {"epoch": whole}, Path("a.csv"), 2)
+        {'epoch': 1}
+    """
+    row = {}
+    for column, parse in columns.items():
+        text = record[column]
+        if text is None:
+            raise DataError(path, column, f"value in line {line} is missing")
+        try:
+            row[column] = parse(text)
+        except ValueError as error:
+            message = f"value in line {line} is {text!r}; expected {error}"
+            raise DataError(path, column, message) from None
+    return row
 
 
 def whole(text: str) -> int:
@@ -251,3 +270,16 @@ def one_of(*valid: str) -> Callable[[str], str]:
         return text
 
     return parse
+
+
+def flag(text: str) -> bool:
+    """A truth value, as 0 or 1.
+
+    Raises:
+        ValueError: if the text is neither.
+
+    Example:
+        >>> flag("1")
+        True
+    """
+    return one_of("0", "1")(text) == "1"

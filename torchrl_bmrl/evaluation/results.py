@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.evaluation.statistics import bootstrap_interval
-from torchrl_bmrl.files import write_atomic
+from torchrl_bmrl.files import (
+    finite,
+    flag,
+    one_of,
+    parse_row,
+    read_rows,
+    whole,
+    write_atomic,
+)
 from torchrl_bmrl.names import TASKS
 
 POLICIES: tuple[str, ...] = (
@@ -29,16 +37,18 @@ POLICIES: tuple[str, ...] = (
 )
 """The policies that a run compares, in the order of the tables."""
 
-RESULT_FIELDS: tuple[str, ...] = (
-    "task",
-    "policy",
-    "latent_source",
-    "seed",
-    "episode",
-    "return",
-    "success",
-)
-"""Columns of ``results.csv``."""
+RESULT_COLUMNS: Mapping[str, Callable[[str], Any]] = {
+    "task": one_of(*TASKS),
+    "policy": one_of(*POLICIES),
+    "latent_source": str,
+    "seed": whole,
+    "episode": whole,
+    "return": finite,
+    "success": flag,
+}
+"""Columns of ``results.csv``, and what makes a value of a text."""
+RESULT_FIELDS: tuple[str, ...] = tuple(RESULT_COLUMNS)
+"""Their names."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,15 +126,28 @@ def read_results(path: str | os.PathLike[str]) -> list[ResultRow]:
         >>> read_results(path) == [row]
         True
     """
-    path = Path(path)
-    if not path.is_file():
-        raise DataError(path, None, f"no such file; expected a CSV with {_listed()}")
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        for field in RESULT_FIELDS:
-            if field not in (reader.fieldnames or ()):
-                raise DataError(path, field, f"column is missing; expected the columns {_listed()}")
-        return [_parse(record, path=path, line=reader.line_num) for record in reader]
+    rows = read_rows(path, RESULT_COLUMNS)
+    return [result_row(row, Path(path), line) for line, row in enumerate(rows, start=2)]
+
+
+def result_row(values: Mapping[str, Any], path: Path, line: int) -> ResultRow:
+    """The row of the values of :data:`RESULT_COLUMNS`.
+
+    Args:
+        values: By column.
+        path: The file that they are from, for the message.
+        line: Number of the line in it, for the message.
+
+    Raises:
+        DataError: if the distilled policy has no source of ``task_latent``, or another one has.
+    """
+    policy, source = values["policy"], values["latent_source"]
+    if (policy == "distilled") != bool(source):
+        expected = "a source's name" if policy == "distilled" else "nothing"
+        message = f"value in line {line} is {source!r}; expected {expected} for policy {policy}"
+        raise DataError(path, "latent_source", message)
+    others = {name: values[name] for name in RESULT_FIELDS if name != "return"}
+    return ResultRow(episode_return=values["return"], **others)
 
 
 def write_results(path: str | os.PathLike[str], rows: Iterable[ResultRow]) -> None:
@@ -159,7 +182,7 @@ def write_results(path: str | os.PathLike[str], rows: Iterable[ResultRow]) -> No
             "return": repr(float(row.episode_return)),
             "success": str(int(row.success)),
         }
-        _parse(record, path=path, line=line)
+        result_row(parse_row(record, RESULT_COLUMNS, path, line), path, line)
         writer.writerow(record)
     write_atomic(path, text.getvalue())
 
@@ -210,49 +233,3 @@ def _summary(key: tuple[str, str, str], rows: list[ResultRow]) -> Summary:
         success_rate=float(successes.mean()),
         success_interval=bootstrap_interval(successes, strata=seeds),
     )
-
-
-def _parse(record: Mapping[str, str | None], *, path: Path, line: int) -> ResultRow:
-    """The row that a record of strings spells, or an error that names file, line and column."""
-
-    def value(field: str, *valid: str) -> str:
-        text = record[field]
-        if text is None or (valid and text not in valid):
-            raise wrong(field, text, f"one of {', '.join(valid)}" if valid else "a value")
-        return text
-
-    def wrong(field: str, text: str | None, expected: str) -> DataError:
-        found = "is missing" if text is None else f"is {text!r}"
-        return DataError(path, field, f"value in line {line} {found}; expected {expected}")
-
-    def whole(field: str) -> int:
-        try:
-            return int(value(field))
-        except ValueError:
-            raise wrong(field, record[field], "a whole number") from None
-
-    task = value("task", *TASKS)
-    policy = value("policy", *POLICIES)
-    source = value("latent_source")
-    if (policy == "distilled") != bool(source):
-        expected = "a source's name" if policy == "distilled" else "nothing"
-        raise wrong("latent_source", source, f"{expected} for policy {policy}")
-    try:
-        episode_return = float(value("return"))
-    except ValueError:
-        episode_return = math.nan
-    if not math.isfinite(episode_return):
-        raise wrong("return", record["return"], "a finite number")
-    return ResultRow(
-        task=task,
-        policy=policy,
-        latent_source=source,
-        seed=whole("seed"),
-        episode=whole("episode"),
-        episode_return=episode_return,
-        success=value("success", "0", "1") == "1",
-    )
-
-
-def _listed() -> str:
-    return ", ".join(RESULT_FIELDS)

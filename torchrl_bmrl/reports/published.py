@@ -13,8 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_bmrl.errors import DataError
-from torchrl_bmrl.evaluation.results import POLICIES, ResultRow, read_results
-from torchrl_bmrl.files import finite, one_of, read_rows, whole, write_rows
+from torchrl_bmrl.evaluation.results import (
+    POLICIES,
+    RESULT_COLUMNS,
+    ResultRow,
+    result_row,
+)
+from torchrl_bmrl.files import finite, flag, one_of, read_rows, whole, write_rows
 from torchrl_bmrl.names import TASKS
 
 MAIN = ("paper", "none")
@@ -160,10 +165,16 @@ def read_published(folder: Path) -> Published:
     files = [folder / f"{name}.csv" for name in ("episodes", "curves", "runs")]
     if not files[2].is_file():
         return Published(episodes=[], curves=[], runs=[])
-    labels = read_rows(files[0], {"preset": _text, "ablation": _text})
-    rows = read_results(files[0])
+    episodes = read_rows(files[0], {"preset": _text, "ablation": _text, **RESULT_COLUMNS})
     published = Published(
-        episodes=[EpisodeRow(**label, row=row) for label, row in zip(labels, rows, strict=True)],
+        episodes=[
+            EpisodeRow(
+                preset=values["preset"],
+                ablation=values["ablation"],
+                row=result_row(values, files[0], line),
+            )
+            for line, values in enumerate(episodes, start=2)
+        ],
         # No run of MAIN, no curves.
         curves=[_curve_row(row) for row in read_rows(files[1], _CURVES)]
         if files[1].is_file()
@@ -259,10 +270,6 @@ def _text(text: str) -> str:
     return text
 
 
-def _flag(text: str) -> bool:
-    return one_of("0", "1")(text) == "1"
-
-
 def _optional(text: str) -> float | None:
     return finite(text) if text else None
 
@@ -274,7 +281,7 @@ _CURVES: Mapping[str, Callable[[str], Any]] = {
     "update": whole,
     "episode": whole,
     "return": finite,
-    "success": _flag,
+    "success": flag,
 }
 _RUNS: Mapping[str, Callable[[str], Any]] = {
     "preset": _text,
