@@ -16,7 +16,7 @@ os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 import json
 import shlex
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ from torchrl_bmrl.reports.published import (
     read_published,
     write_published,
 )
-from torchrl_bmrl.runs import FREE_TO_CHANGE, read_settings, read_versions
+from torchrl_bmrl.runs import deciding, read_settings, read_versions
 
 RECIPES = Path(__file__).resolve().parent
 STAGES = ("collect", "stage 1", "stage 2", "evaluate")
@@ -84,7 +84,7 @@ def read_run(run_dir: Path) -> RunRow:
         BMRLError: if a file of it is missing or not valid.
     """
     settings, versions = read_settings(run_dir), read_versions(run_dir)
-    preset, command = command_of(settings)
+    command = command_of(settings)
     path = run_dir / "seconds.json"
     try:
         seconds = json.loads(path.read_text()) if path.exists() else {}
@@ -93,8 +93,8 @@ def read_run(run_dir: Path) -> RunRow:
     student = run_dir / "distill" / "checkpoint.safetensors"
     _, metadata = load_checkpoint(student, kind="student")
     return RunRow(
-        preset=preset,
-        ablation=settings.get("ablation", "none"),
+        preset=settings["preset"],
+        ablation=settings["ablation"],
         seed=settings["seed"],
         command=command,
         commit=versions.pop("commit", None) or "",
@@ -118,63 +118,34 @@ def read_curves(run_dir: Path, seed: int) -> list[CurveRow]:
     ]
 
 
-def command_of(settings: Mapping[str, Any]) -> tuple[str, str]:
-    """A run's preset, and the command that gives the settings of its ``config.yaml``.
+def command_of(settings: Mapping[str, Any]) -> str:
+    """The command that gives the settings of a run's ``config.yaml``.
 
-    Every preset is composed, or the one that the settings name; that from which the fewest settings
-    differ is the run's, and these become overrides. Settings that the run did not know yet keep
-    their defaults.
+    What differs from its preset and ablation becomes overrides; settings that the run did not know
+    yet keep their defaults.
 
     Raises:
-        ConfigError: if the run has a setting that there is no more, or its preset is gone.
+        ConfigError: if the run names no preset or ablation that there is, or has a setting that
+            there is no more.
     """
-    ablation = settings.get("ablation", "none")
-    presets = sorted(path.stem for path in (RECIPES / "config" / "preset").glob("*.yaml"))
-    if (named := settings.get("preset", presets[0])) not in presets:
-        raise ConfigError(f"preset is {named} in the run; valid: {', '.join(presets)}")
-    told = dict(_flat(settings))
-    candidates = []
-    for preset in [settings["preset"]] if "preset" in settings else presets:
-        choices = [f"preset={preset}", *([f"ablation={ablation}"] if ablation != "none" else [])]
-        composed = OmegaConf.to_container(hydra.compose("recipe", choices), resolve=False)
-        usual = dict(_flat(composed))
-        differing = {key: x for key, x in told.items() if key not in usual or usual[key] != x}
-        away = len(differing) + len(usual.keys() - told.keys())
-        candidates.append((away, preset, choices, differing, usual))
-    _, preset, choices, differing, usual = min(candidates, key=lambda candidate: candidate[0])
+    choices = []
+    for kind in ("preset", "ablation"):
+        valid = sorted(path.stem for path in (RECIPES / "config" / kind).glob("*.yaml"))
+        if (name := settings.get(kind)) not in valid:
+            raise ConfigError(f"{kind} is {name} in the run; valid: {', '.join(valid)}")
+        choices.append(f"{kind}={name}")
+    composed = OmegaConf.to_container(hydra.compose("recipe", choices), resolve=False)
+    usual = deciding(composed)
+    differing = {key: x for key, x in deciding(settings).items() if usual.get(key, ...) != x}
     for key in sorted(differing.keys() - usual.keys()):
         raise ConfigError(f"{key} is a setting of the run; valid: those of today's recipes")
     seed = differing.pop("seed", 0)
-    overrides = [f"{key}={json.dumps(value)}" for key, value in differing.items()]
-    words = ["python", "recipes/two_stage.py", *choices, f"seed={seed}", *overrides]
-    return preset, shlex.join(words)
+    words = [choice for choice in choices if choice != "ablation=none"]
+    words += [f"seed={seed}", *(f"{key}={json.dumps(value)}" for key, value in differing.items())]
+    return shlex.join(["python", "recipes/two_stage.py", *words])
 
 
-def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Settings that decide results, by their dotted names."""
-    for key, value in settings.items():
-        if not prefix and key in FREE_TO_CHANGE:
-            continue
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
-store = ConfigStore.instance()
-store.store(name="publish_schema", node=Settings)
-store.store(
-    name="publish",
-    node={
-        "defaults": [
-            "publish_schema",
-            "_self_",
-            {"override hydra/hydra_logging": "disabled"},
-            {"override hydra/job_logging": "disabled"},
-        ],
-        "hydra": {"output_subdir": None, "run": {"dir": "."}},
-    },
-)
+ConfigStore.instance().store(name="publish_schema", node=Settings)
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="publish")

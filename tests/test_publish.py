@@ -51,9 +51,7 @@ def publish() -> Iterator[Any]:
 def make_settings(*overrides: str) -> dict[str, Any]:
     """What ``config.yaml`` holds of a run with these overrides."""
     config = compose("recipe", [*overrides, "run_dir=runs/a"])
-    # Names of presets are resolved by hydra alone; runs of before they were recorded have none.
-    settings = OmegaConf.to_container(config, resolve=False)
-    return {key: value for key, value in settings.items() if key not in ("preset", "ablation")}
+    return OmegaConf.to_container(config, resolve=False)
 
 
 def rows_of(seed: int, *policies: str) -> list[ResultRow]:
@@ -114,28 +112,33 @@ def test_publishing_again_changes_nothing(publish: Any, tmp_path: Path) -> None:
     [
         ["preset=paper"],
         ["preset=quick", "bcq.lmbda=0.9"],
+        ["preset=paper", "ablation=demos_10", "distill.updates=7"],
         ["preset=literal", "distill.encoder_terms=[generator,qvalue]", "bcq.latent_clip=null"],
         ["preset=compose", "tasks=[lift,reach]", "collect.gains.position=3.0", "bcq.stacked=true"],
     ],
 )
 def test_the_command_of_a_run_gives_its_settings(publish: Any, overrides: list[str]) -> None:
     settings = make_settings(*overrides, "seed=5", "workers=1")
-    preset, command = publish.command_of(settings)
-    assert f"preset={preset}" == overrides[0]
-    python, recipe, *words = shlex.split(command)
+    python, recipe, *words = shlex.split(publish.command_of(settings))
     assert (python, recipe) == ("python", "recipes/two_stage.py")
     assert len(words) == len(overrides) + 1  # and the seed
     again = make_settings(*words)
     assert again | {"workers": 1} == settings
 
 
-def test_a_recorded_preset_is_the_run_s(publish: Any) -> None:
-    settings = make_settings("preset=quick")
-    preset, command = publish.command_of(settings | {"preset": "paper"})
-    assert preset == "paper"
-    assert make_settings(*shlex.split(command)[2:]) == settings
-    with pytest.raises(ConfigError, match=r"preset is huge in the run; valid: compose, .*quick"):
-        publish.command_of(settings | {"preset": "huge"})
+@pytest.mark.parametrize(
+    ("kind", "name", "says"),
+    [
+        ("preset", "huge", r"preset is huge in the run; valid: compose, .*quick"),
+        ("preset", None, r"preset is None in the run; valid: compose, .*quick"),
+        ("ablation", "all", r"ablation is all in the run; valid: acting_1, .*none"),
+    ],
+)
+def test_a_run_of_no_preset_or_ablation_that_there_is_has_no_command(
+    publish: Any, kind: str, name: str | None, says: str
+) -> None:
+    with pytest.raises(ConfigError, match=says):
+        publish.command_of(make_settings("preset=quick") | {kind: name})
 
 
 def test_a_setting_that_is_gone_is_named(publish: Any) -> None:

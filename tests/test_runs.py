@@ -9,6 +9,7 @@ import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -157,6 +158,23 @@ def test_a_run_takes_from_its_base_what_it_would_only_make_again(
     # The base stays as it is when the run goes on, which replaces files.
     write_atomic(run / "data" / "reach.hdf5", "other")
     assert (base / "data" / "reach.hdf5").read_text() == "data/reach.hdf5"
+
+
+def test_a_run_that_was_killed_while_it_took_files_holds_no_others_when_it_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base, run = tmp_path / "base", tmp_path / "run"
+    open_run(base, SETTINGS)
+    (base / "data").mkdir()
+    (base / "data" / "reach.hdf5").write_text("of seed 0")
+    monkeypatch.setattr(runs, "_adopt", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        open_run(run, SETTINGS | {"base": str(base)})
+    monkeypatch.undo()
+    with pytest.raises(ConfigError, match="seed is 1 here and 0 in"):
+        open_run(run, SETTINGS | {"seed": 1})
+    open_run(run, SETTINGS | {"base": str(base)})
+    assert not (run / "data").exists()  # to be made, not half taken
 
 
 def test_a_base_on_another_disk_is_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

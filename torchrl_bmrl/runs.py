@@ -9,7 +9,7 @@ import os
 import platform
 import shutil
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -78,34 +78,46 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
     """
     path = run_dir / "config.yaml"
     if not path.exists():
-        if settings.get("base"):
-            _adopt(run_dir, Path(settings["base"]), settings)
+        base = Path(settings["base"]) if settings.get("base") else None
+        theirs = read_settings(base) if base else {}
         versions = {name: _version(name) for name in PACKAGES}
         versions |= {"torchrl_bmrl": __version__, "python": platform.python_version()}
         if commit := _commit():
             versions["commit"] = commit
         write_atomic(run_dir / "versions.json", json.dumps(versions, indent=2) + "\n")
         write_atomic(path, yaml.safe_dump(dict(settings), sort_keys=False), replace=False)
-    before = dict(_flat(read_settings(run_dir)))
-    now = dict(_flat(settings))
+        if base:  # killed from here on, the run makes what is not there yet
+            patterns = [
+                pattern
+                for pattern, keys in ADOPTED
+                if all(theirs.get(key) == settings.get(key) for key in keys)
+            ]
+            _adopt(run_dir, base, patterns)
+    before, now = deciding(read_settings(run_dir)), deciding(settings)
     for key in sorted(before | now):
-        if key.split(".")[0] in FREE_TO_CHANGE or before.get(key) == now.get(key):
-            continue
-        raise ConfigError(
-            f"{run_dir}: {key} is {now.get(key)} here and {before.get(key)} in the folder's "
-            "run; give the same settings to go on, or another run_dir"
-        )
+        if before.get(key) != now.get(key):
+            raise ConfigError(
+                f"{run_dir}: {key} is {now.get(key)} here and {before.get(key)} in the folder's "
+                "run; give the same settings to go on, or another run_dir"
+            )
 
 
-def _adopt(run_dir: Path, base: Path, settings: Mapping[str, Any]) -> None:
-    """Links what a run would only make again: a file is replaced, never changed, so it may be."""
-    theirs = read_settings(base)
-    for pattern, keys in ADOPTED:
-        if any(theirs.get(key) != settings.get(key) for key in keys):
-            continue
+def deciding(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings that decide a run's result, by their dotted names.
+
+    Example:
+        >>> deciding({"seed": 0, "workers": 2, "bcq": {"lr": 0.001}})
+        {'seed': 0, 'bcq.lr': 0.001}
+    """
+    return dict(_flat({key: x for key, x in settings.items() if key not in FREE_TO_CHANGE}))
+
+
+def _adopt(run_dir: Path, base: Path, patterns: Iterable[str]) -> None:
+    """Links another run's files: a file is replaced, never changed, so it may have two names."""
+    for pattern in patterns:
         for source in base.glob(pattern):
             target = run_dir / source.relative_to(base)
-            if target.exists():  # whole, from a start that was killed or another process
+            if target.exists():  # another process has made it already
                 continue
             target.parent.mkdir(parents=True, exist_ok=True)
             try:
