@@ -397,7 +397,15 @@ def test_an_exported_policy_acts_alone_as_it_does_in_its_run(
 ) -> None:
     import evaluate
 
+    from torchrl_bmrl.agents import load_student
+    from torchrl_bmrl.data.demonstrations import read_statistics
+    from torchrl_bmrl.envs.transforms import ObservationStatistics
+
     policy = shutil.copy(exported / "policy.safetensors", tmp_path)
+    kept = ObservationStatistics.from_lists(load_student(Path(policy))[1]["statistics"])
+    of_data = read_statistics(exported / "data")
+    assert torch.equal(kept.loc, of_data.loc)
+    assert torch.equal(kept.scale, of_data.scale)
     alone = run(tmp_path / "alone", evaluate.evaluate, f"evaluate.policy={policy}")
     distilled = [row for row in read_results(exported / "results.csv") if row.latent_source]
     assert read_results(alone / "results.csv") == distilled

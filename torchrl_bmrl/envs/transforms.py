@@ -232,7 +232,12 @@ class ObservationStatistics:
 
     @classmethod
     def from_lists(cls, lists: Mapping[str, Sequence[float]]) -> ObservationStatistics:
-        """Statistics as a checkpoint's metadata keep them."""
+        """Statistics as a checkpoint's metadata keep them.
+
+        Example:
+            >>> ObservationStatistics.from_lists({"loc": [1.0], "scale": [2.0]})
+            ObservationStatistics(loc=tensor([1.]), scale=tensor([2.]))
+        """
         return cls(torch.tensor(lists["loc"]), torch.tensor(lists["scale"]))
 
     @classmethod
