@@ -237,6 +237,7 @@ def test_sections_without_data_are_left_out() -> None:
         "How long it took",
         "Again",
         "Why returns differ from the paper's",
+        "What was tried",
         "Everything measured",
     ]
     assert page.curves is None

@@ -46,6 +46,7 @@ CURVES = "images/results_curves.png"
 _TEXTS = files("torchrl_bmrl.reports")
 _HEAD = _TEXTS.joinpath("results_head.md").read_text(encoding="utf-8")
 _RETURNS = _TEXTS.joinpath("results_returns.md").read_text(encoding="utf-8")
+_TRIED = _TEXTS.joinpath("results_tried.md").read_text(encoding="utf-8")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +80,7 @@ def make_results_page(published: Published) -> ResultsPage:
         *_ablations(published),
         *_runs(published.runs, baselines=bool(_baselines(rows))),
         Section(heading="Why returns differ from the paper's", paragraphs=[_RETURNS.rstrip()]),
+        Section(heading="What was tried", paragraphs=[_TRIED.rstrip()]),
     ]
     if summaries:
         sections.append(Section(heading="Everything measured", tables=[results_table(summaries)]))
