@@ -195,6 +195,10 @@ def test_baselines_stand_beside_both_stages_under_their_names(page: str) -> None
     lines = {line["Policy"]: line for line in cells(page, "Policies and tasks")}
     assert list(lines) == ["BCQ", "Distilled", "BC", "BCQ, one-hot task"]
     assert lines["BC"]["Lift"] == f"{share('bc', 'expert', 'lift'):.1%} (83%)"
+    published = make_published().episodes
+    for name, policy in (("BCQ", "bcq"), ("BC", "bc")):
+        seeds = {e.row.seed for e in published if e.row.policy == policy and e.preset == "paper"}
+        assert lines[name]["Seeds"] == ", ".join(map(str, sorted(seeds)))
     gains = {line["Policies"]: line for line in cells(page, "What the two stages buy")}
     assert list(gains) == [
         "BCQ over Expert",

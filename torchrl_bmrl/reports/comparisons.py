@@ -287,15 +287,18 @@ def policies_table(
             share = MISSING if gain is None else f"{1 + gain.value:.1%}"
             cells.append(MISSING if rate is None else f"{share} ({rate:.0%})")
         mean = difference(rows, rows, arm, reference)
-        lines.append((name, *cells, MISSING if mean is None else _share(mean)))
+        seeds = sorted({row.seed for row in rows if (row.policy, row.latent_source) == arm})
+        mean_share = MISSING if mean is None else _share(mean)
+        lines.append((name, *cells, mean_share, ", ".join(map(str, seeds))))
     return Table(
         title=title,
         caption=(
             f"{caption} Cells: mean return as a share of {whose} on the "
-            "same starts, and in parentheses the success rate. Last column: mean over tasks of the "
-            "shares, and its 95% interval, episodes resampled in pairs within each task and seed."
+            "same starts, and in parentheses the success rate. Mean over tasks: of the shares, "
+            "with its 95% interval, episodes resampled in pairs within each task and seed. Seeds: "
+            "of the training; policies are compared on the starts of those that they share."
         ),
-        header=("Policy", *map(task_name, TASKS), "Mean over tasks"),
+        header=("Policy", *map(task_name, TASKS), "Mean over tasks", "Seeds"),
         rows=lines,
     )
 
