@@ -392,6 +392,36 @@ def exported(run: Run, finished: Path, tmp_path_factory: pytest.TempPathFactory)
 
 @pytest.mark.robosuite
 @pytest.mark.slow
+def test_the_policy_of_the_repository_plays_all_tasks_and_knows_its_own_demonstrations(
+    run: Run, tmp_path: Path
+) -> None:
+    import evaluate
+
+    from torchrl_bmrl.agents import load_student
+    from torchrl_bmrl.names import TASKS
+
+    policy = RECIPES / "policies" / "sawyer.safetensors"
+    assert policy.stat().st_size < 5e6
+    card = policy.with_suffix(".md").read_text()
+    assert f"evaluate.policy=recipes/policies/{policy.name}" in card
+    config = OmegaConf.to_object(configured(*SMALL, f"evaluate.policy={policy}"))
+    student, metadata = load_student(policy)
+    statistics = evaluate.ObservationStatistics.from_lists(metadata["statistics"])
+    for number, task in enumerate(TASKS):
+        episode = evaluate.held_out_episode(config, task, number, statistics)
+        points = student.task_encoder(episode)
+        logits = student.task_classifier(points)["task_logits"]
+        assert (logits.argmax(-1) == number).float().mean() > 0.95
+    run(tmp_path, evaluate.evaluate, f"evaluate.policy={policy}", f"tasks=[{','.join(TASKS)}]")
+    rows = read_results(tmp_path / "results.csv")
+    sources = {"prototype", "online", "demonstration"}
+    assert {(row.task, row.latent_source) for row in rows} == {
+        (task, source) for task in TASKS for source in sources
+    }
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
 def test_an_exported_policy_acts_alone_as_it_does_in_its_run(
     run: Run, exported: Path, tmp_path: Path
 ) -> None:
