@@ -404,7 +404,8 @@ def test_the_policy_of_the_repository_plays_all_tasks_and_knows_its_own_demonstr
     assert policy.stat().st_size < 5e6
     card = policy.with_suffix(".md").read_text()
     assert f"evaluate.policy=recipes/policies/{policy.name}" in card
-    config = OmegaConf.to_object(configured(*SMALL, f"evaluate.policy={policy}"))
+    options = [f"evaluate.policy={policy}", f"run_dir={tmp_path}"]
+    config = OmegaConf.to_object(configured(*SMALL, *options))
     student, metadata = load_student(policy)
     statistics = evaluate.ObservationStatistics.from_lists(metadata["statistics"])
     for number, task in enumerate(TASKS):
