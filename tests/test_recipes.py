@@ -413,6 +413,11 @@ def test_the_policy_of_the_repository_plays_all_tasks_and_knows_its_own_demonstr
         points = student.task_encoder(episode)
         logits = student.task_classifier(points)["task_logits"]
         assert (logits.argmax(-1) == number).float().mean() > 0.95
+        # Where its expert acted, it acts alike, but for the expert's noise of 0.2.
+        acting = student.policy(num_candidates=100, latent_clip=metadata["latent_clip"])
+        episode["task_latent"] = student.prototypes[number].expand(len(episode), -1)
+        apart = acting(episode.copy())["action"] - episode["action"]
+        assert apart.abs().mean() < 0.2
     run(tmp_path, evaluate.evaluate, f"evaluate.policy={policy}", f"tasks=[{','.join(TASKS)}]")
     rows = read_results(tmp_path / "results.csv")
     sources = {"prototype", "online", "demonstration"}
