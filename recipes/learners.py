@@ -17,7 +17,7 @@ from torch.nn.functional import one_hot
 from torch.optim import Adam
 from torchrl.envs.transforms import CatTensors, Transform
 from torchrl.objectives import CQLLoss, LossModule, SoftUpdate
-from train_bcq import make_update as make_bcq_update
+from train_bcq import choose_updates
 
 from torchrl_bmrl.agents import ACTION_DIM, OBSERVATION_DIM, make_bcq_loss
 from torchrl_bmrl.checkpoint import load_checkpoint, load_state, save_checkpoint
@@ -25,7 +25,6 @@ from torchrl_bmrl.modules import BCQPolicy, PrototypeTaskLatent
 from torchrl_bmrl.parallel import derive_seed
 from torchrl_bmrl.training import (
     Update,
-    accelerate,
     get_rng_state,
     gradient_step,
     load_adam,
@@ -163,7 +162,8 @@ class Learner:
     def choose_updates(self, total: int) -> Callable[[int], Update]:
         """From an update's number, the first being 1, to what it does."""
         if self.algorithm == ONE_HOT:
-            return self.choose_bcq_updates()
+            optimizers = {key.removesuffix("_network"): x for key, x in self.optimizers.items()}
+            return choose_updates(self.config, self.loss, optimizers, self.targets)
         # Never compiled: IQL and CQL do not compile in one piece, and for the others compiling
         # takes longer than it saves.
         objectives = OBJECTIVES[self.algorithm]
@@ -177,21 +177,6 @@ class Learner:
             imitation = make(objectives | imitates, self.targets)
             return lambda number: imitation if number <= IMITATION * total else whole
         return lambda number: whole
-
-    def choose_bcq_updates(self) -> Callable[[int], Update]:
-        """Those of an agent of stage 1."""
-        config, warmup = self.config, self.config.bcq.generator_warmup
-        optimizers = {key.removesuffix("_network"): x for key, x in self.optimizers.items()}
-
-        def accelerated(*networks: str) -> Update:
-            chosen = {name: optimizers[name] for name in networks}
-            update = make_bcq_update(self.loss, chosen, self.targets, config.bcq.critic_grad_clip)
-            options = {"compiled": config.compile, "captured": config.cudagraphs}
-            return accelerate(update, **options, device=config.device)
-
-        whole = accelerated(*optimizers)
-        warm_up = accelerated("generator") if warmup else whole
-        return lambda number: warm_up if number <= warmup else whole
 
     def load(self) -> None:
         """Goes on from what was kept, if anything was."""

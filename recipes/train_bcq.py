@@ -12,6 +12,7 @@ import os
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -84,6 +85,23 @@ def make_update(
     return update
 
 
+def choose_updates(
+    config: Config, loss: LossModule, optimizers: dict[str, Adam], targets: SoftUpdate
+) -> Callable[[int], Update]:
+    """From an update's number, the first being 1, to what it does: at first the generator alone."""
+
+    def accelerated(*networks: str) -> Update:
+        chosen = {name: optimizers[name] for name in networks}
+        update = make_update(loss, chosen, targets, config.bcq.critic_grad_clip)
+        return accelerate(
+            update, compiled=config.compile, captured=config.cudagraphs, device=config.device
+        )
+
+    whole, warmup = accelerated(*optimizers), config.bcq.generator_warmup
+    warm_up = accelerated("generator") if warmup else whole
+    return lambda number: warm_up if number <= warmup else whole
+
+
 def train_agents(
     config: Config,
     agents: dict[str, str],
@@ -118,20 +136,12 @@ def train_on(
     settings, agents = config.bcq, kept.agents
     total = settings.epochs * settings.updates_per_epoch
 
-    def accelerated(*networks: str) -> Update:
-        chosen = {name: kept.optimizers[name] for name in networks}
-        update = make_update(kept.loss, chosen, kept.targets, settings.critic_grad_clip)
-        return accelerate(
-            update, compiled=config.compile, captured=config.cudagraphs, device=config.device
-        )
-
-    update_all = accelerated(*kept.optimizers)
-    warm_up = accelerated("generator") if settings.generator_warmup else update_all
+    choose = choose_updates(config, kept.loss, kept.optimizers, kept.targets)
     run_dir = Path(config.run_dir)
     loggers = {name: make_logger(config.logger, run_dir, f"bcq_{name}") for name in agents}
     for update in range(kept.updates + 1, total + 1):
         batch = buffer.sample().select(*kept.loss.in_keys)
-        metrics = (warm_up if update <= settings.generator_warmup else update_all)(batch)
+        metrics = choose(update)(batch)
         report(len(agents))
         saving = update % config.checkpoint_interval == 0 or update == total
         logging = update % config.log_interval == 0
