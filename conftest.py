@@ -38,6 +38,7 @@ _NEEDS = {
         "torchrl_bmrl/experts/*",
         "torchrl_bmrl/reports/films.py",
     ],
+    "hydra": ["tests/small_runs.py"],
     "matplotlib": ["tests/published_data.py", "torchrl_bmrl/reports/*"],
     "mujoco": ["torchrl_bmrl/reports/films.py"],
     "robosuite": ["torchrl_bmrl/envs/*", "torchrl_bmrl/experts/*"],

@@ -21,12 +21,14 @@ from evaluate import keep_rows, play
 from learners import ALL_TASKS, ONE_HOT, Learner, one_hot_task
 from omegaconf import DictConfig
 from settings import BASELINES, Config, run_recipe
+from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.envs.transforms import Compose
 
 from torchrl_bmrl.data import make_multi_task_replay_buffer
 from torchrl_bmrl.data.demonstrations import load_transitions, read_statistics
+from torchrl_bmrl.errors import StoppedError
 from torchrl_bmrl.evaluation import (
     POLICIES,
     ResultRow,
@@ -36,12 +38,13 @@ from torchrl_bmrl.evaluation import (
     write_results,
 )
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
+from torchrl_bmrl.health import check_metrics
 from torchrl_bmrl.names import HORIZON, TASKS
 from torchrl_bmrl.parallel import Report, run_jobs
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
 from torchrl_bmrl.reports.tables import MISSING, Table, policy_name, task_name
-from torchrl_bmrl.runs import check_finite, log_metrics, make_logger, open_run
+from torchrl_bmrl.runs import log_metrics, make_logger, open_run
 from torchrl_bmrl.training import keep_freed_memory
 
 Job = tuple[Config, str, str]
@@ -81,20 +84,33 @@ def train_job(job: Job, report: Report) -> None:
         report(learner.updates)
     if learner.updates == total:
         return
-    logger = make_logger(config.logger, Path(config.run_dir), f"baselines_{learner.name}")
+    logger = make_logger(
+        config.logger, Path(config.run_dir), f"baselines_{learner.name}", learner.updates
+    )
     choose = learner.choose_updates(total)
-    for number in range(learner.updates + 1, total + 1):
-        batch = buffer.sample().select(*learner.loss.in_keys).reshape(-1)
-        metrics = choose(number)(batch)
-        report(1)
-        saving = number % config.checkpoint_interval == 0 or number == total
-        logging = number % config.log_interval == 0
-        if logging or saving:  # the only places that wait for the device
-            row = {key: float(value) for key, value in metrics.items()}
-            check_finite(row, f"{learner.name}, update {number}")
-            log_metrics(logger if logging else None, row, number)
-        if saving:
+
+    def check(metrics: dict[str, Tensor], number: int) -> dict[str, float]:
+        row = {key: float(value) for key, value in metrics.items()}
+        check_metrics(row, f"{learner.name}, update {number}")
+        return row
+
+    number = learner.updates
+    try:
+        for number in range(learner.updates + 1, total + 1):
+            batch = buffer.sample().select(*learner.loss.in_keys).reshape(-1)
+            metrics = choose(number)(batch)
+            saving = number % config.checkpoint_interval == 0 or number == total
+            logging = number % config.log_interval == 0
+            if logging or saving:  # the only places that wait for the device
+                log_metrics(logger if logging else None, check(metrics, number), number)
+            if saving:
+                learner.save(number)
+            report(1)
+    except StoppedError:
+        if learner.updates < number:
+            check(metrics, number)
             learner.save(number)
+        raise
 
 
 # -- evaluation ------------------------------------------------------------------------------------

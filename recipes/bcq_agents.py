@@ -7,19 +7,25 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from settings import Config
+from settings import Config, deciding_settings
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
 from torchrl_bmrl.agents import make_bcq_loss
-from torchrl_bmrl.checkpoint import load_checkpoint, load_state, save_checkpoint
+from torchrl_bmrl.checkpoint import (
+    keep_training,
+    load_checkpoint,
+    resume_training,
+    save_checkpoint,
+)
 from torchrl_bmrl.envs.transforms import ObservationStatistics
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.health import check_metrics, check_proposals, value_limits
 from torchrl_bmrl.objectives import BCQLoss, StackedLoss
 from torchrl_bmrl.parallel import derive_seed
-from torchrl_bmrl.runs import check_finite
-from torchrl_bmrl.training import get_rng_state, load_adam, make_adam, set_rng_state
+from torchrl_bmrl.training import make_adam
 
 LOSS_SETTINGS = (
     "num_cells",
@@ -92,15 +98,21 @@ class Agents:
         """Agents that have not diverged."""
         return [name for name in self.names if name not in self.diverged]
 
-    def finite(self, metrics: dict[str, Tensor], update: int) -> dict[str, dict[str, float]]:
-        """Every agent's metrics; one whose are not finite is said and left as it was kept last."""
+    def healthy(
+        self, metrics: dict[str, Tensor], batch: TensorDictBase, update: int
+    ) -> dict[str, dict[str, float]]:
+        """Every agent's metrics; one that goes wrong is said and left as it was kept last."""
         columns = {key: torch.atleast_1d(value).tolist() for key, value in metrics.items()}
         rows = {}
         for name in self.well:
             i = self.names.index(name)
             rows[name] = {key: column[i] for key, column in columns.items()}
+            mine = batch if self.kind == "bcq" else batch[i]
+            where = f"bcq {name}, update {update}"
             try:
-                check_finite(rows[name], f"bcq {name}, update {update}")
+                limits = value_limits(mine["next", "reward"], self.config.bcq.gamma)
+                check_metrics(rows[name], where, limits)
+                check_proposals(self.proposals(name, mine), mine["action"], where)
             except BMRLError as error:
                 self.diverged[name] = str(error)
                 if not self.well:
@@ -109,46 +121,65 @@ class Agents:
                 del rows[name]
         return rows
 
+    @torch.no_grad()
+    def proposals(self, name: str, batch: TensorDictBase) -> Tensor:
+        """Some of an agent's candidates, ``(states, candidates, action_dim)``."""
+        loss = self.agent(name)
+        states = batch[:32].select(*loss.observation_keys)
+        states = states.unsqueeze(-1).expand(len(states), 10)
+        device = torch.device(self.config.device)
+        # Training draws the same random numbers whether or not it is looked at.
+        with torch.random.fork_rng([device] if device.type == "cuda" else []):
+            return loss.propose(states, loss.latent_clip)["action"]
+
     def load(self) -> None:
         """Goes on from what was kept, if anything was."""
-        if not self.path.exists():
+        device = self.config.device
+        kept = resume_training(self.path, self.loss, self.optimizers, kind=self.kind, device=device)
+        if kept is None:
             return
-        state, metadata = load_checkpoint(self.path, kind=self.kind)
-        load_state(self.loss, state["loss"], self.path)
-        for name, optimizer in self.optimizers.items():
-            load_adam(optimizer, state["optimizers"][name])
-        set_rng_state(state["rng"], self.config.device)
-        self.updates = metadata["updates"]
+        self.updates = kept["updates"]
         if self.kind == "bcq":
-            self.evaluations = {self.names[0]: metadata["evaluations"]}
+            self.evaluations = {self.names[0]: kept["evaluations"]}
         else:
-            self.evaluations, self.diverged = metadata["evaluations"], metadata["diverged"]
+            self.evaluations, self.diverged = kept["evaluations"], kept["diverged"]
             for name in self.well:
                 path = self.checkpoint(name)
-                if not path.exists() or load_checkpoint(path, kind="bcq")[1] != self.metadata(name):
+                if (
+                    not path.exists()
+                    or load_checkpoint(path, kind="bcq")[1]["updates"] != self.updates
+                ):
                     self.save_agent(name)  # a kill came in between
 
     def save(self, update: int) -> None:
         """Keeps what the training goes on from, and every agent that is well."""
-        state = {
-            "loss": self.loss.state_dict(),
-            "optimizers": {name: o.state_dict() for name, o in self.optimizers.items()},
-            "rng": get_rng_state(self.config.device),
-        }
         self.updates = update
         if self.kind == "bcq":
-            save_checkpoint(self.path, state, self.metadata(self.names[0]))
-            return
-        metadata = {"kind": self.kind, "names": self.names, "updates": update}
-        metadata |= {"evaluations": self.evaluations, "diverged": self.diverged}
-        save_checkpoint(self.path, state, metadata)
-        for name in self.well:
-            self.save_agent(name)
+            metadata = self.metadata(self.names[0])
+        else:
+            metadata = {"kind": self.kind, "names": self.names, "updates": update}
+            metadata |= {"evaluations": self.evaluations, "diverged": self.diverged}
+        options = {"device": self.config.device, "keep": self.config.keep_checkpoints}
+        keep_training(self.path, self.loss, self.optimizers, metadata, **options)
+        if self.kind != "bcq":
+            for name in self.well:
+                self.save_agent(name)
 
     def save_agent(self, name: str) -> None:
         """Keeps a member of a stack on its own, for those who only read it."""
-        state = {"loss": self.agent(name).state_dict()}
+        state = {"module": self.agent(name).state_dict()}
         save_checkpoint(self.checkpoint(name), state, self.metadata(name))
+
+    def keep_best(self, name: str, update: int) -> None:
+        """Keeps an agent's networks if its last epoch's mean return is its highest so far."""
+        returns: dict[int, list[float]] = {}
+        for row in self.evaluations[name]:
+            returns.setdefault(row["epoch"], []).append(row["return"])
+        means = [sum(values) / len(values) for values in returns.values()]
+        if means[-1] == max(means):
+            state = {"module": self.agent(name).state_dict()}
+            metadata = self.metadata(name) | {"updates": update}
+            save_checkpoint(self.folder / name / "best.safetensors", state, metadata)
 
     def metadata(self, name: str) -> dict[str, Any]:
         """What an agent's checkpoint says of it."""
@@ -158,5 +189,6 @@ class Agents:
             "loss": self.options,
             "updates": self.updates,
             "evaluations": self.evaluations[name],
+            "settings": deciding_settings(self.config),
             "statistics": {key: x.tolist() for key, x in vars(self.statistics).items()},
         }

@@ -17,27 +17,27 @@ from pathlib import Path
 import hydra
 import torch
 from omegaconf import DictConfig
-from settings import Config, run_recipe
+from settings import Config, deciding_settings, run_recipe
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_bmrl.agents import Student, load_bcq_loss, make_distillation_loss
-from torchrl_bmrl.checkpoint import load_checkpoint, load_state, save_checkpoint
+from torchrl_bmrl.checkpoint import keep_training, resume_training
 from torchrl_bmrl.data import make_multi_task_replay_buffer, with_previous
 from torchrl_bmrl.data.demonstrations import load_transitions, read_statistics
+from torchrl_bmrl.errors import StoppedError
+from torchrl_bmrl.functional import sample_action_latent
+from torchrl_bmrl.health import check_metrics, check_proposals
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.objectives import BCQLoss
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
-from torchrl_bmrl.runs import check_finite, log_metrics, make_logger
+from torchrl_bmrl.runs import log_metrics, make_logger
 from torchrl_bmrl.training import (
     accelerate,
-    get_rng_state,
     gradient_step,
     keep_freed_memory,
-    load_adam,
     make_adam,
-    set_rng_state,
 )
 
 LOSS_SETTINGS = (
@@ -113,17 +113,15 @@ def train_student(config: Config, report: Report) -> None:
         **{name: getattr(settings, name) for name in LOSS_SETTINGS},
     ).to(config.device)
     optimizer = make_adam(loss.parameters(), lr=settings.lr)
-    done = 0
-    if path.exists():
-        state, metadata = load_checkpoint(path, kind="student")
-        load_state(student, state["student"], path)
-        load_adam(optimizer, state["optimizer"])
-        set_rng_state(state["rng"], config.device)
-        done = metadata["updates"]
+    kept = resume_training(
+        path, student, {"student": optimizer}, kind="student", device=config.device
+    )
+    done = kept["updates"] if kept else 0
+    if done:
         report(done)
-        if done == settings.updates:
-            return
-    logger = make_logger(config.logger, run_dir, "distill")
+    if done == settings.updates:
+        return
+    logger = make_logger(config.logger, run_dir, "distill", done)
 
     def step(batch: TensorDictBase) -> dict[str, Tensor]:
         losses = loss(batch)
@@ -134,34 +132,68 @@ def train_student(config: Config, report: Report) -> None:
     step = accelerate(
         step, compiled=config.compile, captured=config.cudagraphs, device=config.device
     )
-    for update in range(done + 1, settings.updates + 1):
-        if settings.cosine:  # from lr to zero
-            share = (update - 1) / settings.updates
-            rate = settings.lr * (1 + math.cos(math.pi * share)) / 2
-            optimizer.param_groups[0]["lr"].fill_(rate)
-        metrics = step(buffer.sample().select(*loss.in_keys))
-        report(1)
-        if update % config.log_interval == 0:
-            check_finite(metrics, f"distillation, update {update}")
-            log_metrics(logger, metrics, update)
-        if update % config.checkpoint_interval == 0 or update == settings.updates:
-            kept = student if config.device == "cpu" else deepcopy(student).to("cpu")
-            kept.set_prototypes(train, settings.prototype)
-            state = {
-                "student": kept.state_dict(),
-                "optimizer": optimizer.state_dict(),
-                "rng": get_rng_state(config.device),
-            }
-            metadata = {
-                "kind": "student",
-                "tasks": config.tasks,
-                "student": options,
-                "latent_clip": teachers[0].latent_clip,
-                "updates": update,
-                "accuracy": kept.accuracy(torch.cat(valid)),
-                "statistics": {name: x.tolist() for name, x in vars(statistics).items()},
-            }
-            save_checkpoint(path, state, metadata)
+
+    def check(metrics: dict[str, Tensor], batch: TensorDictBase, update: int) -> None:
+        where = f"distillation, update {update}"
+        check_metrics(metrics, where)
+        some = batch[:, :32]
+        proposed = proposals(student, some, teachers[0].latent_clip, config.device)
+        check_proposals(proposed, some["action"], where)
+
+    def save(update: int) -> None:
+        own = student if config.device == "cpu" else deepcopy(student).to("cpu")
+        own.set_prototypes(train, settings.prototype)
+        metadata = {
+            "kind": "student",
+            "tasks": config.tasks,
+            "student": options,
+            "latent_clip": teachers[0].latent_clip,
+            "updates": update,
+            "accuracy": own.accuracy(torch.cat(valid)),
+            "settings": deciding_settings(config),
+            "statistics": {name: x.tolist() for name, x in vars(statistics).items()},
+        }
+        keeping = {"device": config.device, "keep": config.keep_checkpoints}
+        keep_training(path, own, {"student": optimizer}, metadata, **keeping)
+
+    update = saved = done
+    try:
+        for update in range(done + 1, settings.updates + 1):
+            if settings.cosine:  # from lr to zero
+                share = (update - 1) / settings.updates
+                rate = settings.lr * (1 + math.cos(math.pi * share)) / 2
+                optimizer.param_groups[0]["lr"].fill_(rate)
+            batch = buffer.sample()
+            metrics = step(batch.select(*loss.in_keys))
+            saving = update % config.checkpoint_interval == 0 or update == settings.updates
+            logging = update % config.log_interval == 0
+            if logging or saving:
+                check(metrics, batch, update)
+                log_metrics(logger if logging else None, metrics, update)
+            if saving:
+                save(saved := update)
+            report(1)
+    except StoppedError:
+        if saved < update:
+            check(metrics, batch, update)
+            save(update)
+        raise
+
+
+@torch.no_grad()
+def proposals(
+    student: Student, batch: TensorDictBase, latent_clip: float | None, device: str
+) -> Tensor:
+    """Candidates of the student, ``(num_tasks, B, candidates, action_dim)``."""
+    data = batch.select("observation").set("task_latent", student.embed(batch))
+    data = data.unsqueeze(-1).expand(*data.batch_size, 10)
+    on_gpu = torch.device(device).type == "cuda"
+    # Training draws the same random numbers whether or not it is looked at.
+    with torch.random.fork_rng([torch.device(device)] if on_gpu else []):
+        latent = sample_action_latent(
+            (*data.batch_size, student.latent_dim), latent_clip=latent_clip, device=device
+        )
+    return student.generator(data.set("action_latent", latent))["action"]
 
 
 def distill(config: Config) -> None:

@@ -83,7 +83,7 @@ def export(config: Config) -> None:
     path = run_dir / "policy.safetensors"
     save_checkpoint(
         path,
-        {"student": student.state_dict(), "demonstrations": demonstrations},
+        {"module": student.state_dict(), "demonstrations": demonstrations},
         metadata | {"preset": config.preset, "seed": config.seed, "versions": versions},
     )
     card = CARD.format(

@@ -15,10 +15,8 @@ import os
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
-import csv
 import importlib
 import statistics
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -51,11 +49,14 @@ from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import LossModule, SoftUpdate, TD3Loss
 
 from torchrl_bmrl.checkpoint import load_checkpoint, save_checkpoint
-from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
+from torchrl_bmrl.command_line import exit_codes
+from torchrl_bmrl.errors import ConfigError, UnknownNameError
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
-from torchrl_bmrl.files import write_atomic, write_rows
+from torchrl_bmrl.files import finite, read_rows, whole, write_atomic, write_rows
+from torchrl_bmrl.health import check_metrics
+from torchrl_bmrl.locks import hold
 from torchrl_bmrl.parallel import Report, available_cores, derive_seed, run_jobs
-from torchrl_bmrl.runs import check_finite, open_run
+from torchrl_bmrl.runs import open_run
 
 
 @dataclass
@@ -194,7 +195,7 @@ def train(settings: Settings, name: str, seed: int, report: Report) -> list[floa
         update(value)
         report(1)
         if i % 100 == 0:
-            check_finite({"loss": value.detach()}, f"{name}, seed {seed}, update {i}")
+            check_metrics({"loss": value.detach()}, f"{name}, seed {seed}, update {i}")
     policy, returns = make_policy(), []
     for i in range(settings.eval_episodes):
         with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -222,8 +223,8 @@ def run_job(job: tuple[Settings, str, int], report: Report) -> list[Row]:
     path = Path(settings.run_dir) / "results" / f"{name}-seed{seed}.csv"
     if path.exists():
         report(job_size(settings, name))
-        with path.open(newline="") as file:
-            return list(csv.DictReader(file))
+        columns = {"algorithm": str, "seed": whole, "episode": whole, "return": finite}
+        return read_rows(path, columns)
     if name == BEHAVIOUR:
         returns = make_batch(settings, seed, report)
     else:
@@ -326,15 +327,14 @@ ConfigStore.instance().store(name="extrapolation_schema", node=Settings)
 
 @hydra.main(version_base="1.3", config_path="config", config_name="extrapolation")
 def main(config: DictConfig) -> None:
-    """Command line; an expected error becomes one line and exit code 1."""
-    try:
+    """Command line."""
+    with exit_codes():
         settings = OmegaConf.to_object(config)
         check_settings(settings)
-        open_run(Path(settings.run_dir), asdict(settings))
-        extrapolation(settings)
-    except BMRLError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(1) from error
+        run_dir = Path(settings.run_dir)
+        with hold(run_dir):
+            open_run(run_dir, asdict(settings))
+            extrapolation(settings)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ import os
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
-import csv
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
@@ -43,7 +42,7 @@ from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.evaluation import bootstrap_interval
 from torchrl_bmrl.evaluation.rollout import evaluate_policy
 from torchrl_bmrl.experts.collect import collect_episode
-from torchrl_bmrl.files import write_rows
+from torchrl_bmrl.files import read_rows, whole, write_rows
 from torchrl_bmrl.modules import DemonstrationTaskLatent, StageTaskLatent
 from torchrl_bmrl.modules.task_latent import ALIGNMENTS
 from torchrl_bmrl.names import composition_stages, horizon_of
@@ -179,8 +178,17 @@ def imitate_job(job: Job, report: Report) -> list[dict]:
             for i, outcome in enumerate(outcomes)
         ]
         write_rows(path, rows)
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+    return read_rows(path, COLUMNS)
+
+
+COLUMNS = {
+    "method": str,
+    "perturbation": str,
+    "demonstration": whole,
+    "episode": whole,
+    "stages": whole,
+    "success": whole,
+}
 
 
 def imitation_table(config: Config, rows: list[dict]) -> Table:
@@ -190,16 +198,16 @@ def imitation_table(config: Config, rows: list[dict]) -> Table:
     for method in METHODS:
         for perturbation in PERTURBATIONS:
             mine = [r for r in rows if (r["method"], r["perturbation"]) == (method, perturbation)]
-            done = [int(row["stages"]) for row in mine]
-            whole = [float(row["success"]) for row in mine]
-            low, high = bootstrap_interval(whole, strata=[row["demonstration"] for row in mine])
+            done = [row["stages"] for row in mine]
+            all_done = [float(row["success"]) for row in mine]
+            low, high = bootstrap_interval(all_done, strata=[row["demonstration"] for row in mine])
             reached = [sum(d > i for d in done) / len(done) for i in range(len(stages))]
             lines.append(
                 (
                     method,
                     perturbation,
                     *(f"{share:.0%}" for share in reached),
-                    f"{sum(whole) / len(whole):.0%}",
+                    f"{sum(all_done) / len(all_done):.0%}",
                     f"[{low:.0%}, {high:.0%}]",
                     str(len(mine)),
                 )

@@ -16,7 +16,6 @@ import os
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
-import csv
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -50,7 +49,7 @@ from torchrl_bmrl.evaluation.behaviour import (
 )
 from torchrl_bmrl.evaluation.paths import data_path, straight_path, switched_path
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
-from torchrl_bmrl.files import write_rows
+from torchrl_bmrl.files import number, read_rows, whole, write_rows
 from torchrl_bmrl.modules import BCQPolicy, PathTaskLatent
 from torchrl_bmrl.names import HORIZON, TASKS
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
@@ -313,17 +312,19 @@ def run_job(job: Job, report: Report) -> None:
 
 def read_episodes(path: Path) -> dict[str, np.ndarray]:
     """What :func:`make_rows` made, as arrays ``(N, T, ...)``; labels ``(N,)``."""
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    count = 1 + max(int(row["episode"]) for row in rows)
+    positions = [name for names in POSITIONS.values() for name in names]
+    measured = [*positions, "along", "deviation", "success"]
+    columns = {"episode": whole, "step": whole, "label": str, **dict.fromkeys(measured, number)}
+    rows = read_rows(path, columns)
+    count = 1 + max(row["episode"] for row in rows)
 
     def column(*names: str) -> np.ndarray:
-        values = np.array([[float(row[name]) for name in names] for row in rows])
+        values = np.array([[row[name] for name in names] for row in rows])
         return values.reshape(count, -1, len(names))
 
     episodes = {name: column(*columns) for name, columns in POSITIONS.items()}
     episodes |= {name: column(name)[..., 0] for name in ("along", "deviation", "success")}
-    return episodes | {"label": np.array([row["label"] for row in rows if row["step"] == "0"])}
+    return episodes | {"label": np.array([row["label"] for row in rows if row["step"] == 0])}
 
 
 # -- what came of it -------------------------------------------------------------------------------

@@ -15,7 +15,6 @@ import os
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
-import csv
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
@@ -37,13 +36,14 @@ from torchrl_bmrl.agents import load_student
 from torchrl_bmrl.data.demonstrations import load_transitions, read_statistics
 from torchrl_bmrl.envs.transforms import StageReward, make_env
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
-from torchrl_bmrl.files import write_rows
+from torchrl_bmrl.files import finite, read_rows, whole, write_rows
+from torchrl_bmrl.health import check_metrics
 from torchrl_bmrl.modules import HeldTaskLatent, task_latent_box
 from torchrl_bmrl.modules.generator import Network, make_mlp
 from torchrl_bmrl.names import composition_stages, horizon_of
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
 from torchrl_bmrl.reports import Picture, Section, Table, success_curves, write_study
-from torchrl_bmrl.runs import check_finite, open_run
+from torchrl_bmrl.runs import open_run
 
 VARIANTS = ("latent", "raw")
 """What the agent's action is: m, or the robot's."""
@@ -58,6 +58,15 @@ STATE = ["observation", "progress"]
 
 Job = tuple[Config, str, int]
 Row = dict[str, str | int | float]
+
+
+COLUMNS = {
+    "variant": str,
+    "seed": whole,
+    "environment_steps": whole,
+    "success": finite,
+    "stages": finite,
+}
 
 
 def output_dir(config: Config) -> Path:
@@ -134,8 +143,7 @@ def train_job(job: Job, report: Report) -> list[Row]:
     settings = config.latent_sac
     path = output_dir(config) / f"{variant}-seed{seed}.csv"
     if path.exists():
-        with path.open(newline="") as file:
-            kept: list[Row] = list(csv.DictReader(file))
+        kept: list[Row] = read_rows(path, COLUMNS)
         if int(kept[-1]["environment_steps"]) >= settings.environment_steps:
             report(settings.environment_steps)
             return kept
@@ -177,7 +185,7 @@ def train_job(job: Job, report: Report) -> list[Row]:
             last = steps >= settings.environment_steps
             if last or steps >= len(rows) * settings.eval_interval:
                 if updates:
-                    check_finite(losses.detach(), f"{variant}, seed {seed}, step {steps}")
+                    check_metrics(losses.detach(), f"{variant}, seed {seed}, step {steps}")
                 rows.append(evaluate(config, loss, eval_env, variant, seed, steps))
                 write_rows(path, rows)
             if last:

@@ -14,7 +14,6 @@ import os
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
-import csv
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +33,7 @@ from torchrl_bmrl.envs.transforms import make_env, transform_data
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation import bootstrap_interval
 from torchrl_bmrl.evaluation.rollout import evaluate_policy
-from torchrl_bmrl.files import write_atomic, write_rows
+from torchrl_bmrl.files import finite, read_rows, whole, write_atomic, write_rows
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.names import HORIZON
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
@@ -91,15 +90,15 @@ def evaluate_job(job: Job, report: Report) -> list[dict]:
         write_rows(path, rows)
     else:
         report(config.evaluate.episodes * HORIZON)
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+    columns = {"training_seed": whole, "episode": whole, "success": whole}
+    return read_rows(path, {"share": finite, **columns, "return": finite})
 
 
 def comparison(rows: list[dict], shares: list[float]) -> str:
     """Table of all shares, with the difference from share 0 on the same starts."""
 
     def column(share: float, field: str) -> np.ndarray:
-        return np.array([float(row[field]) for row in rows if float(row["share"]) == share])
+        return np.array([float(row[field]) for row in rows if row["share"] == share])
 
     lines = [
         "| Human share | Return | Success | Return against share 0 (95% interval) | Human data |",

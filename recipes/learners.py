@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from algorithms import Algorithm, bc, cql, iql, td3_bc
 from bcq_agents import LOSS_SETTINGS
-from settings import Config
+from settings import Config, deciding_settings
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import one_hot
@@ -20,16 +20,13 @@ from torchrl.objectives import CQLLoss, LossModule, SoftUpdate
 from train_bcq import choose_updates
 
 from torchrl_bmrl.agents import ACTION_DIM, OBSERVATION_DIM, make_bcq_loss
-from torchrl_bmrl.checkpoint import load_checkpoint, load_state, save_checkpoint
+from torchrl_bmrl.checkpoint import keep_training, resume_training
 from torchrl_bmrl.modules import BCQPolicy, PrototypeTaskLatent
 from torchrl_bmrl.parallel import derive_seed
 from torchrl_bmrl.training import (
     Update,
-    get_rng_state,
     gradient_step,
-    load_adam,
     make_adam,
-    set_rng_state,
 )
 
 BUILDERS = {build.__name__: build for build in (bc, td3_bc, iql, cql)}
@@ -180,21 +177,15 @@ class Learner:
 
     def load(self) -> None:
         """Goes on from what was kept, if anything was."""
-        if not self.path.exists():
-            return
-        state, metadata = load_checkpoint(self.path, kind="baseline")
-        load_state(self.loss, state["loss"], self.path)
-        for name, optimizer in self.optimizers.items():
-            load_adam(optimizer, state["optimizers"][name])
-        set_rng_state(state["rng"], self.config.device)
-        self.updates = metadata["updates"]
+        kept = resume_training(
+            self.path, self.loss, self.optimizers, kind="baseline", device=self.config.device
+        )
+        self.updates = kept["updates"] if kept else 0
 
     def save(self, updates: int) -> None:
         """Keeps what the training goes on from."""
-        state = {
-            "loss": self.loss.state_dict(),
-            "optimizers": {name: o.state_dict() for name, o in self.optimizers.items()},
-            "rng": get_rng_state(self.config.device),
-        }
+        self.updates = updates
         metadata = {"kind": "baseline", "name": self.name, "updates": updates}
-        save_checkpoint(self.path, state, metadata)
+        metadata |= {"settings": deciding_settings(self.config)}
+        options = {"device": self.config.device, "keep": self.config.keep_checkpoints}
+        keep_training(self.path, self.loss, self.optimizers, metadata, **options)

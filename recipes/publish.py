@@ -15,7 +15,6 @@ os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 import json
 import shlex
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,8 +26,10 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_bmrl.checkpoint import load_checkpoint
-from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
+from torchrl_bmrl.command_line import exit_codes
+from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.evaluation import read_results
+from torchrl_bmrl.files import read_json
 from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports import check_results_page, write_results_page
 from torchrl_bmrl.reports.published import (
@@ -86,10 +87,7 @@ def read_run(run_dir: Path) -> RunRow:
     settings, versions = read_settings(run_dir), read_versions(run_dir)
     command = command_of(settings)
     path = run_dir / "seconds.json"
-    try:
-        seconds = json.loads(path.read_text()) if path.exists() else {}
-    except ValueError as error:
-        raise DataError(path, None, f"not the seconds of a run ({error})") from error
+    seconds = read_json(path, "the seconds of a run") if path.exists() else {}
     student = run_dir / "distill" / "checkpoint.safetensors"
     _, metadata = load_checkpoint(student, kind="student")
     return RunRow(
@@ -150,12 +148,9 @@ ConfigStore.instance().store(name="publish_schema", node=Settings)
 
 @hydra.main(version_base="1.3", config_path="config", config_name="publish")
 def main(config: DictConfig) -> None:
-    """Command line; an expected error becomes one line and exit code 1."""
-    try:
+    """Command line."""
+    with exit_codes():
         publish(OmegaConf.to_object(config))
-    except BMRLError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(1)
 
 
 if __name__ == "__main__":

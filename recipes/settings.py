@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_bmrl.agents import LATENT_SOURCES, TASK_ENCODERS
+from torchrl_bmrl.command_line import exit_codes
 from torchrl_bmrl.data.replay import check_device
-from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
+from torchrl_bmrl.errors import ConfigError, UnknownNameError
 from torchrl_bmrl.experts.controllers import ExpertGains
+from torchrl_bmrl.locks import hold
 from torchrl_bmrl.names import STEPPERS, TASKS, check_task, composition_stages
 from torchrl_bmrl.objectives.bcq import TARGET_DTYPES
 from torchrl_bmrl.objectives.checks import check_value_bounds
@@ -21,7 +26,7 @@ from torchrl_bmrl.objectives.common import LOSS_FUNCTIONS
 from torchrl_bmrl.objectives.distillation import CONTEXTS, ENCODER_TERMS
 from torchrl_bmrl.objectives.generative import KL_REDUCTIONS
 from torchrl_bmrl.parallel import available_cores
-from torchrl_bmrl.runs import LOGGERS, open_run
+from torchrl_bmrl.runs import LOGGERS, deciding, open_run
 
 BASELINES = ("bc", "td3_bc", "iql", "cql", "bcq_one_hot")
 
@@ -176,6 +181,7 @@ class Config:
     logger: str = "csv"  # csv, wandb, tensorboard, none
     log_interval: int = 100  # updates
     checkpoint_interval: int = 1000  # updates
+    keep_checkpoints: int = 2  # the newest, and those before it in case that is damaged
     collect: CollectSettings = field(default_factory=CollectSettings)
     bcq: BCQSettings = field(default_factory=BCQSettings)
     distill: DistillSettings = field(default_factory=DistillSettings)
@@ -191,6 +197,7 @@ POSITIVE = (
     "workers",
     "log_interval",
     "checkpoint_interval",
+    "keep_checkpoints",
     "bcq.epochs",
     "bcq.updates_per_epoch",
     "bcq.eval_episodes",
@@ -217,7 +224,50 @@ POSITIVE = (
     "latent_sac.environment_steps",
     "latent_sac.eval_interval",
     "latent_sac.eval_episodes",
+    "collect.valid_episodes",
+    "collect.gains.position",
+    "collect.gains.grasp_position",
+    "collect.gains.rotation",
+    "collect.gains.speed_limit",
+    "collect.gains.contact_speed_limit",
+    "collect.gains.lift_height",
+    "bcq.num_cells",
+    "bcq.tau",
+    "distill.num_cells",
 )
+POSITIVE_OR_NULL = ("bcq.critic_grad_clip", "bcq.latent_clip", "baselines.updates")
+NOT_NEGATIVE = (
+    "collect.noise",
+    "collect.gains.grasp_steps",
+    "bcq.kl_weight",
+    "bcq.max_perturbation",
+    "bcq.generator_warmup",
+    "distill.classification_weight",
+    "distill.generator_weight",
+    "distill.direction_weight",
+    "distill.qvalue_weight",
+    "distill.latent_norm_weight",
+    "distill.metric_weight",
+    "distill.metric_margin",
+    "distill.isometry_weight",
+    "imitate.max_angle",
+    "latent_sac.random_steps",
+)
+SHARES = (
+    "collect.gains.speed_limit",
+    "collect.gains.contact_speed_limit",
+    "bcq.lmbda",
+    "bcq.gamma",
+    "bcq.tau",
+    "distill.context_fraction",
+    "human.shares",
+)
+RANGES = {
+    POSITIVE: (sys.float_info.min, sys.float_info.max, "above 0"),
+    POSITIVE_OR_NULL: (sys.float_info.min, sys.float_info.max, "above 0, or null"),
+    NOT_NEGATIVE: (0.0, sys.float_info.max, "0 or above"),
+    SHARES: (0.0, 1.0, "between 0 and 1"),
+}
 CHOICES = {
     "logger": LOGGERS,
     "stepper": STEPPERS,
@@ -262,23 +312,19 @@ def check_settings(config: Config) -> None:
     for key, valid in CHOICES.items():
         if (value := OmegaConf.select(settings, key)) not in valid:
             raise UnknownNameError(key, value, valid)
-    for key in POSITIVE:
-        if (value := OmegaConf.select(settings, key)) <= 0:
-            raise ConfigError(f"{key} is {value}; valid: above 0")
-    for key in ("bcq.lmbda", "bcq.gamma", "distill.context_fraction"):
-        if not 0 <= (value := OmegaConf.select(settings, key)) <= 1:
-            raise ConfigError(f"{key} is {value}; valid: between 0 and 1")
-    for key in (
-        "bcq.generator_warmup",
-        "collect.noise",
-        "distill.metric_weight",
-        "distill.isometry_weight",
-    ):
-        if (value := OmegaConf.select(settings, key)) < 0:
-            raise ConfigError(f"{key} is {value}; valid: 0 or above")
-    for key in ("bcq.critic_grad_clip", "bcq.latent_clip"):
-        if (value := OmegaConf.select(settings, key)) is not None and value <= 0:
-            raise ConfigError(f"{key} is {value}; valid: above 0, or null")
+    for keys, (low, high, valid) in RANGES.items():
+        for key in keys:
+            value = OmegaConf.select(settings, key)
+            for number in OmegaConf.to_object(value) if OmegaConf.is_list(value) else [value]:
+                # Not the other way round: "not a number" is within no range.
+                if number is not None and not low <= number <= high:
+                    raise ConfigError(f"{key} is {value}; valid: {valid}")
+    for task, number in config.collect.train_episodes.items():
+        if number < 1:
+            raise ConfigError(f"collect.train_episodes.{task} is {number}; valid: above 0")
+    low, high = config.imitate.magnitude
+    if not 0 < low <= high < math.inf:
+        raise ConfigError(f"imitate.magnitude is ({low}, {high}); valid: two factors, low to high")
     composition_stages(config.imitate.composition)
     if config.imitate.episodes % config.imitate.demonstrations:
         raise ConfigError(
@@ -299,46 +345,56 @@ def check_settings(config: Config) -> None:
         if term not in ENCODER_TERMS:
             raise UnknownNameError("encoder term", term, ENCODER_TERMS)
     shares = config.human.shares
-    if 0 not in shares or len(set(shares)) < len(shares) or not all(0 <= x <= 1 for x in shares):
+    if 0 not in shares or len(set(shares)) < len(shares):
         raise ConfigError(f"human.shares is {shares}; valid: 0 and others up to 1, each once")
     composition_stages(config.latent_sac.composition)
     seeds, steps = config.latent_sac.seeds, config.latent_sac.random_steps
     if not seeds or len(set(seeds)) < len(seeds):
         raise ConfigError(f"latent_sac.seeds is {seeds}; valid: at least one, each once")
-    if not 0 <= steps <= config.latent_sac.environment_steps:
+    if steps > config.latent_sac.environment_steps:
         raise ConfigError(f"latent_sac.random_steps is {steps}; valid: 0 to environment_steps")
-    names, updates = config.baselines.algorithms, config.baselines.updates
+    names = config.baselines.algorithms
     for name in names:
         if name not in BASELINES:
             raise UnknownNameError("baseline", name, BASELINES)
     if not names or len(set(names)) < len(names):
         raise ConfigError(f"baselines.algorithms is {names}; valid: at least one, each once")
-    if updates is not None and updates < 1:
-        raise ConfigError(f"baselines.updates is {updates}; valid: above 0, or null")
-    if config.collect.valid_episodes < 1 or min(config.collect.train_episodes.values()) < 1:
-        raise ConfigError("collect.train_episodes and collect.valid_episodes; valid: at least 1")
+
+
+def deciding_settings(config: Config) -> dict[str, Any]:
+    """What decides a run's result, by dotted names: a checkpoint says how it came about."""
+    return deciding(OmegaConf.to_container(OmegaConf.structured(config)))
+
+
+OUT_OF_MEMORY = (
+    "lower bcq.batch_size or bcq.seeds in stage 1 (bcq.stacked=false trains one agent at a time), "
+    "distill.batch_size in stage 2"
+)
 
 
 def run_recipe(
     settings: DictConfig, run: Callable[[Config], None], *, splits: bool = False
 ) -> None:
-    """Runs a recipe in its run folder; an expected error becomes one line and exit code 1.
+    """Runs a recipe in its run folder, which it holds meanwhile; ends as a command should.
 
     Args:
         settings: what the command line and the preset say.
         run: the recipe.
         splits: it does the tasks of ``only`` and leaves the others to other jobs.
     """
-    try:
-        config = OmegaConf.to_object(settings)
+    with exit_codes(out_of_memory=OUT_OF_MEMORY):
+        try:
+            config = OmegaConf.to_object(settings)
+        except OmegaConfBaseException as error:  # a reference to nothing, say
+            raise ConfigError(str(error).partition("\n")[0]) from error
         check_settings(config)
         if config.only is not None and not splits:
             raise ConfigError(f"only is {config.only}; valid: null, except with train_bcq.py")
-        open_run(Path(config.run_dir), OmegaConf.to_container(settings, resolve=True))
-        run(config)
-    except BMRLError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(1) from error
+        run_dir = Path(config.run_dir)
+        # A job of only some tasks leaves the others', and all else, to other jobs.
+        with hold(run_dir, config.only or ["run", *config.tasks]):
+            open_run(run_dir, OmegaConf.to_container(settings, resolve=True))
+            run(config)
 
 
 OmegaConf.register_new_resolver(

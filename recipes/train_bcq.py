@@ -29,7 +29,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 from torchrl_bmrl.data import make_multi_task_replay_buffer, make_replay_buffer
 from torchrl_bmrl.data.demonstrations import load_transitions, read_statistics
 from torchrl_bmrl.envs.transforms import ObservationStatistics, make_env
-from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.errors import BMRLError, StoppedError
 from torchrl_bmrl.evaluation.rollout import evaluate_policy
 from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.modules import BCQPolicy
@@ -138,24 +138,34 @@ def train_on(
 
     choose = choose_updates(config, kept.loss, kept.optimizers, kept.targets)
     run_dir = Path(config.run_dir)
-    loggers = {name: make_logger(config.logger, run_dir, f"bcq_{name}") for name in agents}
-    for update in range(kept.updates + 1, total + 1):
-        batch = buffer.sample().select(*kept.loss.in_keys)
-        metrics = choose(update)(batch)
-        report(len(agents))
-        saving = update % config.checkpoint_interval == 0 or update == total
-        logging = update % config.log_interval == 0
-        if logging or saving:  # the only places that wait for the device
-            for name, row in kept.finite(metrics, update).items():
-                log_metrics(loggers[name] if logging else None, row, update)
-        if update % settings.updates_per_epoch == 0:
-            epoch = update // settings.updates_per_epoch
-            for name in kept.well:
-                loss, rows = kept.agent(name), kept.evaluations[name]
-                rows += evaluate_epoch(config, agents[name], loss, statistics, epoch, update)
-                write_rows(kept.folder / name / "evaluations.csv", rows)
-        if saving:
+    loggers = {
+        name: make_logger(config.logger, run_dir, f"bcq_{name}", kept.updates) for name in agents
+    }
+    update = kept.updates
+    try:
+        for update in range(kept.updates + 1, total + 1):
+            batch = buffer.sample().select(*kept.loss.in_keys)
+            metrics = choose(update)(batch)
+            saving = update % config.checkpoint_interval == 0 or update == total
+            logging = update % config.log_interval == 0
+            if logging or saving:  # the only places that wait for the device
+                for name, row in kept.healthy(metrics, batch, update).items():
+                    log_metrics(loggers[name] if logging else None, row, update)
+            if update % settings.updates_per_epoch == 0:
+                epoch = update // settings.updates_per_epoch
+                for name in kept.well:
+                    loss, rows = kept.agent(name), kept.evaluations[name]
+                    rows += evaluate_epoch(config, agents[name], loss, statistics, epoch, update)
+                    write_rows(kept.folder / name / "evaluations.csv", rows)
+                    kept.keep_best(name, update)
+            if saving:
+                kept.save(update)
+            report(len(agents))
+    except StoppedError:
+        if kept.updates < update:
+            kept.healthy(metrics, batch, update)
             kept.save(update)
+        raise
 
 
 def evaluate_epoch(config, task, loss, statistics, epoch, update) -> list[dict]:

@@ -24,7 +24,7 @@ from omegaconf import DictConfig
 from settings import Config, run_recipe
 from train_bcq import train_all
 
-from torchrl_bmrl.files import write_atomic
+from torchrl_bmrl.files import read_json, write_atomic
 
 STAGES = {"collect": collect, "stage 1": train_all, "stage 2": distill, "evaluate": evaluate}
 
@@ -32,7 +32,7 @@ STAGES = {"collect": collect, "stage 1": train_all, "stage 2": distill, "evaluat
 def two_stage(config: Config) -> None:
     """Runs the stages one after the other; each skips what it finds done."""
     path = Path(config.run_dir) / "seconds.json"
-    seconds = json.loads(path.read_text()) if path.exists() else {}
+    seconds = read_json(path, "the seconds of a run") if path.exists() else {}
     for name, stage in STAGES.items():
         started = time.monotonic()
         stage(config)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import struct
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -17,11 +19,24 @@ from torch import Tensor, nn
 pytest.importorskip("safetensors")
 
 from torchrl_bmrl.agents import Student, load_bcq_loss, load_student, make_bcq_loss
-from torchrl_bmrl.checkpoint import load_checkpoint, load_state, save_checkpoint
+from torchrl_bmrl.checkpoint import (
+    earlier,
+    load_checkpoint,
+    load_newest,
+    load_state,
+    save_checkpoint,
+)
 from torchrl_bmrl.errors import CheckpointError
 from torchrl_bmrl.modules import BCQPolicy
 
 META = {"kind": "example", "epochs": 3, "tasks": ["reach", "σ"], "loss": {"clip": None, "lr": 1e-5}}
+SAID = {
+    "tasks": ["reach", "lift", "push_up"],
+    "latent_clip": 0.5,
+    "accuracy": 0.9,
+    "statistics": {"loc": [0.0, 1.0, 2.0], "scale": [1.0, 1.0, 0.5]},
+}
+"""What a student's checkpoint must say beside its networks."""
 SMALL = {"num_cells": [8], "observation_dim": 3, "action_dim": 2}
 
 
@@ -80,6 +95,7 @@ def test_a_nested_state_comes_back_bit_by_bit(path: Path) -> None:
     save_checkpoint(path, state, META)
     loaded, metadata = load_checkpoint(path, kind="example")
     assert same(state, loaded)
+    assert metadata.pop("versions")["torch"] == torch.__version__
     assert metadata == META
 
 
@@ -135,7 +151,7 @@ def test_five_updates_and_five_more_equal_ten(path: Path) -> None:
 def test_a_trained_loss_comes_back_from_its_file_alone(path: Path, perturbation: bool) -> None:
     options = {**SMALL, "perturbation": perturbation, "num_candidates": 5, "latent_clip": None}
     loss = make_bcq_loss(**options)
-    save_checkpoint(path, {"loss": loss.state_dict()}, {"kind": "bcq", "loss": options})
+    save_checkpoint(path, {"module": loss.state_dict()}, {"kind": "bcq", "loss": options})
     again, metadata = load_bcq_loss(path)
     assert metadata["loss"] == options
     assert again.num_candidates == 5
@@ -155,7 +171,7 @@ def test_a_student_comes_back_with_its_prototypes(path: Path) -> None:
     student = Student(**options)
     student.prototypes.normal_()
     save_checkpoint(
-        path, {"student": student.state_dict()}, {"kind": "student", "student": options}
+        path, {"module": student.state_dict()}, {"kind": "student", "student": options, **SAID}
     )
     again, _ = load_student(path)
     assert same(dict(student.state_dict()), dict(again.state_dict()))
@@ -165,7 +181,7 @@ def test_a_student_without_an_encoder_is_refused_by_the_missing_key(path: Path) 
     options = {**SMALL, "num_tasks": 3, "latent_dim": 4}
     state = Student(**options).state_dict()
     rest = {key: value for key, value in state.items() if not key.startswith("task_encoder")}
-    save_checkpoint(path, {"student": rest}, {"kind": "student", "student": options})
+    save_checkpoint(path, {"module": rest}, {"kind": "student", "student": options})
     with pytest.raises(CheckpointError, match="task_encoder"):
         load_student(path)
 
@@ -175,6 +191,89 @@ def test_a_second_save_replaces_the_first(path: Path) -> None:
     save_checkpoint(path, {"a": torch.zeros(2)}, META)
     assert load_checkpoint(path, kind="example")[0].keys() == {"a"}
     assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+# -- several, one of them damaged ----------------------------------------------------------------
+
+
+def steps(path: Path) -> dict[str, int]:
+    """By name, the step of every checkpoint in a folder."""
+    files = sorted(path.parent.glob("*.safetensors"))
+    return {file.name: load_checkpoint(file, kind="example")[0]["step"] for file in files}
+
+
+def keep_four(path: Path, keep: int) -> None:
+    for step in range(4):
+        save_checkpoint(path, {"step": step}, META, keep=keep)
+
+
+@pytest.mark.parametrize("keep", [1, 2, 3])
+def test_the_last_ones_are_kept_and_no_more(path: Path, keep: int) -> None:
+    keep_four(path, keep)
+    names = ["checkpoint.safetensors", "checkpoint.1.safetensors", "checkpoint.2.safetensors"]
+    assert steps(path) == {name: 3 - i for i, name in enumerate(names[:keep])}
+    assert len(list(path.parent.iterdir())) == keep
+
+
+@pytest.mark.parametrize("moment", ["link_or_copy", "write_atomic"])
+def test_killed_while_it_rotates_the_newest_one_is_there(
+    path: Path, moment: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keep_four(path, 3)
+    with monkeypatch.context() as patch:
+        patch.setattr(f"torchrl_bmrl.checkpoint.{moment}", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            save_checkpoint(path, {"step": 4}, META, keep=3)
+    found = load_newest(path, kind="example")
+    assert found is not None
+    assert found[0] == {"step": 3}
+    save_checkpoint(path, {"step": 4}, META, keep=3)
+    assert steps(path)["checkpoint.safetensors"] == 4
+    assert steps(path)["checkpoint.1.safetensors"] == 3
+
+
+def test_without_a_checkpoint_there_is_nothing_to_go_on_from(tmp_path: Path) -> None:
+    assert load_newest(tmp_path / "none" / "a.safetensors", kind="example") is None
+
+
+@pytest.mark.parametrize("damaged", [1, 2])
+def test_a_damaged_newest_is_said_and_set_aside_and_the_one_before_is_the_newest(
+    path: Path, damaged: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    keep_four(path, 3)
+    for file in [path, earlier(path, 1)][:damaged]:
+        data = bytearray(file.read_bytes())
+        data[-1] ^= 1
+        file.write_bytes(data)
+    found = load_newest(path, kind="example")
+    assert found is not None
+    assert found[0] == {"step": 3 - damaged}
+    said = capsys.readouterr().err
+    assert f"{path}: not a whole checkpoint" in said
+    assert f"going on from checkpoint.{damaged}.safetensors" in said
+    assert path.with_name("checkpoint.damaged.safetensors").exists()
+    path.with_name("checkpoint.damaged.safetensors").unlink()
+    assert steps(path)["checkpoint.safetensors"] == 3 - damaged
+    # The next one does not push a good one out for a damaged one.
+    save_checkpoint(path, {"step": 4}, META, keep=2)
+    assert steps(path)["checkpoint.1.safetensors"] == 3 - damaged
+
+
+def test_when_all_are_damaged_the_newest_is_named_and_all_stay(path: Path) -> None:
+    keep_four(path, 2)
+    for file in path.parent.iterdir():
+        file.write_bytes(b"x")
+    with pytest.raises(CheckpointError, match="not a whole checkpoint") as info:
+        load_newest(path, kind="example")
+    assert info.value.path == path
+    assert len(list(path.parent.iterdir())) == 2
+
+
+def test_another_kind_is_refused_and_not_passed_over(path: Path) -> None:
+    keep_four(path, 2)
+    with pytest.raises(CheckpointError, match="kind is 'example'; valid: 'student'"):
+        load_newest(path, kind="student")
+    assert len(steps(path)) == 2
 
 
 # -- refusals ----------------------------------------------------------------------------------
@@ -219,20 +318,20 @@ def test_a_flipped_bit_in_the_header_s_length_is_refused_by_name(saved: Path, bi
     refused(saved, "not a whole checkpoint")
 
 
-def test_a_flipped_bit_in_the_header_never_ends_in_another_error(saved: Path) -> None:
-    data = saved.read_bytes()
+def test_any_flipped_bit_is_refused_by_name_or_changes_nothing(saved: Path) -> None:
+    data, expected = saved.read_bytes(), load_checkpoint(saved, kind="example")
     (length,) = struct.unpack("<Q", data[:8])
-    assert length > 500
-    count = 0
-    for bit in random.Random(0).sample(range(64, 64 + 8 * length), 400):
+    refused_bits = 0
+    for bit in random.Random(0).sample(range(8 * len(data)), 1000):
         flipped = bytearray(data)
         flipped[bit // 8] ^= 1 << bit % 8
         saved.write_bytes(flipped)
         try:
-            load_checkpoint(saved, kind="example")
+            assert same(load_checkpoint(saved, kind="example"), expected)
+            assert bit < 8 * (8 + length)  # in the header alone: a blank in its JSON
         except CheckpointError:
-            count += 1
-    assert count > 200
+            refused_bits += 1
+    assert refused_bits > 900
 
 
 def test_a_pickle_is_refused_and_not_run(path: Path) -> None:
@@ -288,10 +387,116 @@ def test_a_missing_key_is_named_with_where_it_is_missing(saved: Path, where: str
 
 def test_networks_of_another_size_are_refused_by_name(path: Path) -> None:
     loss = make_bcq_loss(**SMALL)
-    options = {**SMALL, "num_cells": [16]}
-    save_checkpoint(path, {"loss": loss.state_dict()}, {"kind": "bcq", "loss": options})
+    options = {**SMALL, "num_cells": [7]}
+    save_checkpoint(path, {"module": loss.state_dict()}, {"kind": "bcq", "loss": options})
     with pytest.raises(CheckpointError, match="has shape"):
         load_bcq_loss(path)
+
+
+def with_header(path: Path, header: Any) -> None:
+    """Writes a checkpoint whose header says this, its checksum right if it has a place for one."""
+    from safetensors.torch import save
+
+    from torchrl_bmrl import checkpoint
+
+    tensors = {"/a": torch.ones(2)}
+    if isinstance(header, dict):
+        header = {**header, "sha256": checkpoint._checksum(header, tensors)}
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(save(tensors, {"checkpoint": json.dumps(header)}))
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        [],
+        7,
+        {"state": {}},
+        {"metadata": {"kind": "example"}},
+        {"state": {}, "metadata": [1]},
+        {"state": {}, "metadata": None},
+        {"state": {"__tensor__": "/b"}, "metadata": {"kind": "example"}},
+        {"state": {"__tensor__": ["/a"]}, "metadata": {"kind": "example"}},
+        {"state": {"__pairs__": 3}, "metadata": {"kind": "example"}},
+        {"state": {"__pairs__": [[1]]}, "metadata": {"kind": "example"}},
+        {"state": {"__pairs__": [[[], 1]]}, "metadata": {"kind": "example"}},
+    ],
+)
+def test_a_header_of_another_structure_is_refused_by_name(path: Path, header: Any) -> None:
+    with_header(path, header)
+    refused(path, "not a whole checkpoint")
+
+
+def test_a_header_nested_without_end_is_refused_by_name(path: Path) -> None:
+    from safetensors.torch import save
+
+    path.parent.mkdir()
+    text = '{"state": ' + "[" * 100_000 + "]" * 100_000 + "}"
+    path.write_bytes(save({"a": torch.ones(1)}, {"checkpoint": text}))
+    refused(path, "not a whole checkpoint")
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf")])
+def test_parameters_that_are_not_finite_are_not_acted_with(path: Path, number: float) -> None:
+    state = make_bcq_loss(**SMALL).state_dict()
+    key = next(key for key in state if key.endswith("0.weight"))
+    state[key][1, 2] = number
+    save_checkpoint(path, {"module": state}, {"kind": "bcq", "loss": SMALL})
+    with pytest.raises(CheckpointError, match=f"'{key}' holds numbers that are not finite"):
+        load_bcq_loss(path)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        (None, "says nothing of its networks"),
+        ({**SMALL, "num_cells": [10**9]}, "num_cells is .*no tensor in the file is that large"),
+        ({**SMALL, "num_cells": [8] * 999}, "num_cells is .*no tensor in the file is that large"),
+        ({**SMALL, "num_qvalue_nets": 10**9}, "num_qvalue_nets is .*that large"),
+        ({**SMALL, "num_cells": "eight"}, "not the settings of networks"),
+        ({**SMALL, "num_cells": [-1]}, "not the settings of networks"),
+        ({**SMALL, "hidden": 8}, "not the settings of networks"),
+        ({**SMALL, "latent_clip": -1.0}, "not the settings of networks"),
+    ],
+)
+def test_settings_of_no_networks_are_refused_before_any_are_made(
+    path: Path, options: Any, match: str
+) -> None:
+    state = {"module": make_bcq_loss(**SMALL).state_dict()}
+    save_checkpoint(path, state, {"kind": "bcq", "loss": options})
+    with pytest.raises(CheckpointError, match=match) as info:
+        load_bcq_loss(path)
+    assert info.value.path == path
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("tasks", ["reach", "lift"]),
+        ("tasks", ["reach", "lift", "../../etc/passwd"]),
+        ("tasks", "abc"),
+        ("tasks", [["reach"], "lift", "push_up"]),
+        ("latent_clip", -1),
+        ("latent_clip", "0.5"),
+        ("latent_clip", float("nan")),
+        ("accuracy", 2),
+        ("accuracy", None),
+        ("statistics", {"loc": [0.0], "scale": [1.0, 2.0]}),
+        ("statistics", {"loc": [0.0], "scale": [0.0]}),
+        ("statistics", {"loc": ["0"], "scale": [1.0]}),
+        ("statistics", {"loc": [float("inf")], "scale": [1.0]}),
+        ("statistics", {"loc": 1.0, "scale": 1.0}),
+        ("statistics", []),
+    ],
+)
+def test_what_a_student_must_say_is_checked_when_it_is_loaded(
+    path: Path, key: str, value: Any
+) -> None:
+    options = {**SMALL, "num_tasks": 3, "latent_dim": 4}
+    metadata = {"kind": "student", "student": options, **SAID, key: value}
+    save_checkpoint(path, {"module": Student(**options).state_dict()}, metadata)
+    with pytest.raises(CheckpointError, match=f"{key} is .*; valid: "):
+        load_student(path)
 
 
 @pytest.mark.parametrize("failure", ["state", "metadata", "disk"])

@@ -245,7 +245,8 @@ def test_check_lists_everything_that_is_wrong_and_fails(path: Path, capsys: Any)
 def test_the_command_converts_and_says_so(path: Path, tmp_path: Path, capsys: Any) -> None:
     assert main(["convert", str(path), str(tmp_path / "b.hdf5"), "--to", "robomimic"]) == 0
     assert "b.hdf5: robomimic, 4 episodes" in capsys.readouterr().out
-    assert main(["convert", str(path), str(tmp_path / "b.hdf5"), "--to", "robomimic"]) == 1
+    with pytest.raises(SystemExit, match="1"):
+        main(["convert", str(path), str(tmp_path / "b.hdf5"), "--to", "robomimic"])
     assert capsys.readouterr().err == f"error: {tmp_path / 'b.hdf5'}: exists; valid: a new name\n"
 
 

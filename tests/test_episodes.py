@@ -99,6 +99,14 @@ def test_a_part_of_the_observation_cannot_take_a_name_of_torchrl_s(name: str) ->
         as_tensordict(wrong)
 
 
+@pytest.mark.parametrize("name", ["../../evil", "a/b", ".hidden", "..", "", "a\\b"])
+def test_a_part_of_the_observation_cannot_be_named_like_a_path(name: str) -> None:
+    parts = {name: np.zeros((3, 1))}
+    wrong = replace(episode(0, 3), observations=parts, next_observations=parts)
+    with pytest.raises(BMRLError, match="valid: a name without slashes"):
+        as_tensordict(wrong)
+
+
 def test_no_episodes_are_refused() -> None:
     with pytest.raises(BMRLError, match="at least one"):
         stack_episodes([], task=0)

@@ -18,6 +18,8 @@ pytest.importorskip("mujoco")
 pytest.importorskip("safetensors")
 pytest.importorskip("tqdm")
 
+from torchrl_bmrl.errors import BMRLError
+
 RECIPE = Path(__file__).parents[1] / "recipes" / "extrapolation.py"
 ALGORITHMS = ["ddpg", "bc", "td3_bc", "iql", "plas", "bcq"]
 SMALL = [
@@ -103,7 +105,7 @@ def test_an_invalid_setting_is_one_line_that_says_what_is_valid(
 
     with initialize(version_base="1.3", config_path="../recipes/config"):
         config = compose("extrapolation", overrides=[*SMALL, override])
-    with pytest.raises(extrapolation.BMRLError, match=f"^{says}") as error:
+    with pytest.raises(BMRLError, match=f"^{says}") as error:
         extrapolation.check_settings(OmegaConf.to_object(config))
     assert "\n" not in str(error.value)
 

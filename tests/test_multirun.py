@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -22,7 +23,7 @@ pytest.importorskip("tqdm")
 import yaml
 from hydra import compose, initialize_config_dir
 
-from torchrl_bmrl.errors import ConfigError
+from torchrl_bmrl.errors import ConfigError, StoppedError
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 SMALL = [
@@ -106,6 +107,22 @@ def test_a_job_returns_what_went_wrong_and_starts_where_the_sweep_was_started(
     assert "FileNotFoundError" in run_job(well, str(tmp_path / "elsewhere"), {})
 
 
+@pytest.mark.parametrize("cause", [StoppedError(signal.SIGTERM), KeyboardInterrupt()])
+def test_a_job_that_is_asked_to_stop_stops_the_sweep(
+    beside: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cause: BaseException
+) -> None:
+    from hydra_plugins.reporting_sweeper import run_job
+
+    monkeypatch.chdir(tmp_path)
+
+    def stopped(config: Any) -> None:
+        raise SystemExit(143) from cause
+
+    with pytest.raises(SystemExit) as end:
+        run_job(stopped, str(tmp_path), {})
+    assert end.value.code == 143
+
+
 # -- sweeps ----------------------------------------------------------------------------------------
 
 
@@ -160,7 +177,7 @@ def check_sweep_of_three_seeds(cwd: Path, alone: list[dict[str, bytes]], *launch
     for seed, expected in zip((0, 2), alone, strict=True):
         assert len(expected) > 3
         assert contents(cwd / "runs" / f"collect-smoke-seed{seed}", "data/**/*") == expected
-    assert [path.name for path in taken.iterdir()] == ["config.yaml"]
+    assert {path.name for path in taken.iterdir()} == {"config.yaml", ".locks"}
     assert [path.name for path in cwd.iterdir()] == ["runs"]
     assert [path.name for path in cwd.glob("runs/multirun/*/*")] == ["multirun.yaml"]
 
@@ -203,7 +220,7 @@ def test_agents_spread_over_jobs_are_those_of_one_run(run: Any, tmp_path: Path) 
     done = sweep("train_bcq", *SMALL, *options, *launcher, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     expected = contents(one, "bcq/**/*")
-    assert len(expected) == 6
+    assert len(expected) == 9  # checkpoint, best networks and rollouts of each
     assert contents(spread, "bcq/**/*") == expected
 
 

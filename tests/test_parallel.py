@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import pickle
 import signal
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -20,9 +22,11 @@ from torchrl_bmrl.errors import (
     CheckpointError,
     ConfigError,
     DataError,
+    StoppedError,
     UnknownNameError,
 )
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
+from torchrl_bmrl.stops import stop_on_signals
 
 OPTIONS: dict[str, Any] = {"total": 8, "description": "stage 1: training", "unit": "update"}
 
@@ -102,7 +106,11 @@ def fail_unexpectedly(job: int, report: Report) -> None:
 
 
 @pytest.mark.slow
-def test_an_unexpected_error_of_a_worker_comes_with_its_traceback() -> None:
+@pytest.mark.timeout(120)
+def test_an_unexpected_error_of_a_worker_comes_with_its_traceback_and_the_others_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(parallel, "GRACE", 3600.0)  # nobody has to be killed
     with pytest.raises(ZeroDivisionError, match="job 1") as caught:
         run_jobs(fail_unexpectedly, [1, 1], workers=2, **OPTIONS)
     assert "in fail_unexpectedly" in str(caught.value.__cause__)
@@ -112,6 +120,108 @@ def test_an_unexpected_error_of_a_worker_comes_with_its_traceback() -> None:
 def test_an_expected_error_of_a_worker_arrives_whole() -> None:
     with pytest.raises(CheckpointError, match="runs/lift"):
         run_jobs(fail, ["lift", "lift"], workers=2, **OPTIONS)
+
+
+def hang_once(job: tuple[str, Path], report: Report) -> str:
+    """The first worker at a job reports one unit and says nothing more."""
+    name, folder = job
+    report(1)
+    if name == "hangs" and not (folder / name).exists():
+        (folder / name).touch()
+        time.sleep(600)
+    report(1)
+    return name
+
+
+@pytest.mark.slow
+def test_a_worker_that_hangs_is_named_and_killed_and_its_job_done_again(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Long enough for a process to start and import this.
+    monkeypatch.setattr(parallel, "SILENCE", 20.0)
+    jobs = [("hangs", tmp_path), ("fine", tmp_path)]
+    assert run_jobs(hang_once, jobs, workers=2, **OPTIONS) == ["hangs", "fine"]
+    said = capfd.readouterr().err
+    assert "a worker said nothing for 20 s and was killed in job 1 of 2; the job is done" in said
+
+
+def work_until_stopped(job: tuple[str, Path], report: Report) -> None:
+    """Keeps what it did when it is stopped; ``fails`` fails when all others are at work."""
+    name, folder = job
+    done = 0
+    try:
+        while True:
+            (folder / f"{name}.started").touch()
+            time.sleep(0.01)
+            done += 1
+            if name == "fails" and len(list(folder.glob("*.started"))) == 2:
+                raise CheckpointError("runs/lift", "no manifest")
+            report(1)
+    except StoppedError:
+        (folder / name).write_text(str(done))
+        raise
+
+
+def signal_when_all_work(folder: Path, names: str, number: signal.Signals) -> threading.Thread:
+    """Signals this process when every job has started."""
+
+    def wait() -> None:
+        while not all((folder / f"{name}.started").exists() for name in names):
+            time.sleep(0.05)
+        os.kill(os.getpid(), number)
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    return thread
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("workers", "names", "number"),
+    [(1, "a", signal.SIGTERM), (2, "ab", signal.SIGTERM), (2, "ab", signal.SIGINT)],
+)
+def test_asked_to_stop_every_job_keeps_what_it_did(
+    tmp_path: Path, workers: int, names: str, number: signal.Signals
+) -> None:
+    jobs = [(name, tmp_path) for name in names]
+    with stop_on_signals():
+        thread = signal_when_all_work(tmp_path, names, number)
+        with pytest.raises(StoppedError, match=number.name):
+            run_jobs(work_until_stopped, jobs, workers=workers, **OPTIONS)
+    thread.join()
+    for name in names:
+        assert int((tmp_path / name).read_text()) >= 1
+
+
+@pytest.mark.slow
+def test_when_a_job_fails_the_others_keep_what_they_did(tmp_path: Path) -> None:
+    jobs = [("other", tmp_path), ("fails", tmp_path)]
+    with pytest.raises(CheckpointError, match="no manifest"):
+        run_jobs(work_until_stopped, jobs, workers=2, **OPTIONS)
+    assert int((tmp_path / "other").read_text()) >= 1
+
+
+def sleep(job: int, report: Report) -> None:
+    report(1)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    report(1)
+    time.sleep(600)
+
+
+@pytest.mark.slow
+def test_a_worker_that_does_not_stop_in_time_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parallel, "GRACE", 1.0)
+    reported: list[int] = []
+
+    def update(bar: Any, units: int) -> None:
+        reported.append(units)
+        if len(reported) == 4:
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(parallel, "tqdm", type("Bar", (parallel.tqdm,), {"update": update}))
+    with stop_on_signals(), pytest.raises(StoppedError):
+        run_jobs(sleep, [1, 2], workers=2, **OPTIONS)
+    assert not multiprocessing.active_children()
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,32 +22,11 @@ pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
 import yaml
-from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
+from small_runs import HORIZON, RECIPES, SMALL, Interruption, Run, configured, contents, times
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.evaluation import RESULT_FIELDS, read_results
-
-RECIPES = Path(__file__).parents[1] / "recipes"
-HORIZON = 10
-SMALL = [
-    "preset=smoke",
-    "tasks=[reach,lift]",
-    "collect.train_episodes.reach=1",
-    "collect.train_episodes.lift=1",
-    "bcq.epochs=2",
-    "bcq.updates_per_epoch=6",
-    "bcq.batch_size=8",
-    "bcq.num_cells=[16,16]",
-    "distill.updates=12",
-    "distill.batch_size=8",
-    "distill.num_cells=[16,16]",
-    "evaluate.num_candidates=5",
-    "evaluate.latent_sources=[prototype,online,demonstration]",
-    "log_interval=4",
-    "checkpoint_interval=4",
-]
-"""The smallest run that has every part."""
 
 
 def recipe(name: str, *overrides: str, cwd: Path, **env: str) -> subprocess.CompletedProcess[str]:
@@ -61,21 +39,6 @@ def recipe(name: str, *overrides: str, cwd: Path, **env: str) -> subprocess.Comp
         text=True,
         timeout=900,
     )
-
-
-@pytest.fixture(scope="module")
-def recipes() -> Iterator[Any]:
-    """The recipes' modules, importable as they are for a script beside them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(RECIPES))
-        import settings
-
-        yield settings
-
-
-def configured(*overrides: str) -> DictConfig:
-    with initialize_config_dir(version_base="1.3", config_dir=str(RECIPES / "config")):
-        return compose("recipe", overrides=list(overrides))
 
 
 # -- the command line ------------------------------------------------------------------------------
@@ -113,7 +76,8 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
         "error: run/data/statistics.json: no such file; recipes/collect.py writes it"
     )
     assert "Traceback" not in done.stderr
-    assert {path.name for path in (tmp_path / "run").iterdir()} == {"config.yaml", "versions.json"}
+    left = {path.name for path in (tmp_path / "run").iterdir()}
+    assert left == {"config.yaml", "versions.json", ".locks"}
 
 
 @pytest.mark.parametrize(
@@ -156,7 +120,7 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
         ("latent_sac.composition=reach-lfit", "unknown task 'lfit'"),
         ("latent_sac.hold=0", "latent_sac.hold is 0"),
         ("latent_sac.seeds=[1,1]", r"latent_sac.seeds is \[1, 1\]; valid: at least one, each once"),
-        ("latent_sac.random_steps=-1", "latent_sac.random_steps is -1; valid: 0 to"),
+        ("latent_sac.random_steps=-1", "latent_sac.random_steps is -1; valid: 0 or above"),
         ("baselines.algorithms=[ddpg]", "unknown baseline 'ddpg'; .*td3_bc, iql, cql, bcq_one_hot"),
         ("baselines.algorithms=[bc,bc]", r"baselines.algorithms is .*; valid: .*each once"),
         ("baselines.updates=0", "baselines.updates is 0; valid: above 0, or null"),
@@ -239,56 +203,9 @@ def test_what_each_ablation_takes_away_is_away(recipes: Any, tmp_path: Path) -> 
 
 # -- whole runs ------------------------------------------------------------------------------------
 
-Run = Callable[..., Path]
-
-
-def contents(folder: Path, *patterns: str) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for pattern in patterns
-        for path in sorted(folder.glob(pattern))
-        if path.is_file()
-    }
-
-
-def times(folder: Path) -> dict[str, int]:
-    """When what is costly was written."""
-    patterns = ("data/*.hdf5", "**/*.safetensors", "evaluation/*.csv", "bcq/*/evaluations.csv")
-    return {
-        str(path.relative_to(folder)): path.stat().st_mtime_ns
-        for pattern in patterns
-        for path in folder.glob(pattern)
-    }
-
 
 def show_results(folder: Path) -> dict[str, bytes]:
     return contents(folder, "results.csv", "tables/*", "bcq/*/evaluations.csv")
-
-
-@pytest.fixture(scope="module")
-def run(recipes: Any) -> Iterator[Run]:
-    """Runs a recipe's function in this process, with episodes of ten steps."""
-    pytest.importorskip("robosuite", exc_type=ImportError)
-    from torchrl_bmrl import names
-    from torchrl_bmrl.evaluation import rollout
-
-    def run(folder: Path, function: Any, *overrides: str) -> Path:
-        settings = configured(*SMALL, f"run_dir={folder}", "workers=1", *overrides)
-        recipes.run_recipe(settings, function)
-        return folder
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(names, "HORIZON", HORIZON)
-        patch.setitem(rollout.evaluate_policy.__kwdefaults__, "max_steps", HORIZON)
-        yield run
-
-
-@pytest.fixture(scope="module")
-def finished(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of all stages that was never stopped."""
-    import two_stage
-
-    return run(tmp_path_factory.mktemp("finished"), two_stage.two_stage)
 
 
 @pytest.mark.robosuite
@@ -504,7 +421,7 @@ def test_two_workers_give_the_same_bytes_as_one(finished: Path, tmp_path: Path) 
     assert done.returncode == 0, done.stderr
     assert show_results(tmp_path / "run") == show_results(finished)
     checkpoints = contents(finished, "**/*.safetensors")
-    assert len(checkpoints) == 3
+    assert len(checkpoints) == 2 * 3 + 2
     assert contents(tmp_path / "run", "**/*.safetensors") == checkpoints
 
 
@@ -526,24 +443,12 @@ def test_a_run_goes_on_with_other_workers_but_not_with_other_settings(
     assert show_results(folder) == before
 
 
-class Interruption:
-    """A progress callback that stops the job at one of its updates."""
-
-    def __init__(self, update: int, error: type[BaseException]) -> None:
-        self.done, self.update, self.error = 0, update, error
-
-    def __call__(self, count: int) -> None:
-        self.done += count
-        if self.done == self.update:
-            raise self.error("stopped by the test")
-
-
 @pytest.mark.robosuite
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("update", "kept", "error"),
     # Checkpoints are due after updates 4, 8 and 12, evaluations after 6 and 12.
-    [(3, None, KeyboardInterrupt), (7, 4, KeyboardInterrupt), (12, 8, BMRLError)],
+    [(3, None, KeyboardInterrupt), (7, 4, KeyboardInterrupt), (12, 12, BMRLError)],
 )
 def test_stage_1_resumed_equals_never_stopped(
     run: Run, finished: Path, tmp_path: Path, update: int, kept: int | None, error: Any
@@ -565,9 +470,43 @@ def test_stage_1_resumed_equals_never_stopped(
     train_bcq.train_job((config, {"lift": "lift"}), counted.append)
     # What the checkpoint holds is reported at once and not trained again.
     assert counted == ([kept] if kept else []) + [1] * (12 - (kept or 0))
-    expected = contents(finished, "bcq/lift/*")
-    assert len(expected) == 2
-    assert contents(tmp_path, "bcq/lift/*") == expected
+    expected = contents(finished, *LIFT)
+    assert len(expected) == 4 + 7
+    assert contents(tmp_path, *LIFT) == expected
+
+
+LIFT = ("bcq/lift/*", "logs/bcq_lift/scalars/*")
+"""What stage 1 makes of it: checkpoints (newest, before, best), evaluations; metrics."""
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", ["write_rows", "Agents.keep_best", "Agents.save"])
+def test_stage_1_killed_between_two_files_goes_on_to_the_same_ones(
+    run: Run, finished: Path, tmp_path: Path, moment: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import train_bcq
+
+    shutil.copytree(finished / "data", tmp_path / "data")
+    config = OmegaConf.to_object(configured(*SMALL, f"run_dir={tmp_path}"))
+    owner: Any = train_bcq
+    *parts, name = moment.split(".")
+    for part in parts:
+        owner = getattr(owner, part)
+    whole, calls = getattr(owner, name), []
+
+    def killed(*arguments: Any) -> None:
+        calls.append(arguments)
+        if len(calls) == 2:  # at update 12, or 8 of the checkpoints
+            raise KeyboardInterrupt
+        whole(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, killed)
+        with pytest.raises(KeyboardInterrupt):
+            train_bcq.train_job((config, {"lift": "lift"}), lambda count: None)
+    train_bcq.train_job((config, {"lift": "lift"}), lambda count: None)
+    assert contents(tmp_path, *LIFT) == contents(finished, *LIFT)
 
 
 STACKED = ("bcq.stacked=true", "bcq.seeds=2")
@@ -603,7 +542,7 @@ def test_every_member_of_a_stack_has_a_checkpoint_and_curves_of_its_own(stacked:
 
 @pytest.mark.robosuite
 @pytest.mark.slow
-@pytest.mark.parametrize(("update", "kept"), [(3, None), (7, 4), (12, 8)])
+@pytest.mark.parametrize(("update", "kept"), [(3, None), (7, 4), (12, 12)])
 def test_a_stack_resumed_equals_one_never_stopped(
     run: Run, stacked: Path, finished: Path, tmp_path: Path, update: int, kept: int | None
 ) -> None:
@@ -623,7 +562,7 @@ def test_a_stack_resumed_equals_one_never_stopped(
     train_bcq.train_job((config, AGENTS), counted.append)
     assert sum(counted) == 12 * len(AGENTS)
     expected = contents(stacked, "bcq/**/*")
-    assert len(expected) == 1 + 2 * len(AGENTS)
+    assert len(expected) == 2 + 3 * len(AGENTS)
     assert contents(tmp_path, "bcq/**/*") == expected
 
 
@@ -726,12 +665,13 @@ def test_compiled_stages_train_what_eager_ones_do(
     for stage in (train_bcq.train_all, distill.distill):
         run(tmp_path, stage, "compile=true")
     assert "not accelerated" not in capsys.readouterr().err
-    for path, kind, key in (
-        ("bcq/lift/checkpoint.safetensors", "bcq", "loss"),
-        ("distill/checkpoint.safetensors", "student", "student"),
+    for path, kind in (
+        ("bcq/lift/checkpoint.safetensors", "bcq"),
+        ("distill/checkpoint.safetensors", "student"),
     ):
         compiled, eager = (
-            load_checkpoint(folder / path, kind=kind)[0][key] for folder in (tmp_path, finished)
+            load_checkpoint(folder / path, kind=kind)[0]["module"]
+            for folder in (tmp_path, finished)
         )
         for name, value in eager.items():
             torch.testing.assert_close(compiled[name], value, rtol=0, atol=1e-4)
@@ -744,11 +684,19 @@ def test_without_a_gpu_captured_stages_say_so_and_train_the_same(
 ) -> None:
     import train_bcq
 
+    from torchrl_bmrl.agents import load_bcq_loss
+
     shutil.copytree(finished / "data", tmp_path / "data")
     run(tmp_path, train_bcq.train_all, "cudagraphs=true", "tasks=[lift]")
     assert "device=cpu has no CUDA graphs" in capsys.readouterr().err
-    expected = contents(finished, "bcq/lift/*")
-    assert contents(tmp_path, "bcq/lift/*") == expected
+    for name in ("best", "checkpoint.1", "checkpoint"):  # they say how they were trained
+        captured, eager = (
+            load_bcq_loss(folder / "bcq" / "lift" / f"{name}.safetensors")[0].state_dict()
+            for folder in (tmp_path, finished)
+        )
+        torch.testing.assert_close(captured, eager, rtol=0, atol=0)
+    expected = contents(finished, "bcq/lift/*.csv")
+    assert contents(tmp_path, "bcq/lift/*.csv") == expected
 
 
 def trained(
@@ -769,9 +717,9 @@ def trained(
     torch.manual_seed(derive_seed(config.seed, "bcq", "lift"))
     start = make_bcq_loss(**metadata["loss"]).state_dict()
     way = max(
-        float((state["loss"][key] - start[key]).abs().max())
+        float((state["module"][key] - start[key]).abs().max())
         for key in start
-        if key.startswith("qvalue_network_params") and key in state["loss"]
+        if key.startswith("qvalue_network_params") and key in state["module"]
     )
     return state, way, {path.stem for path in (folder / "logs").rglob("bcq_lift/**/*.csv")}
 
@@ -798,13 +746,13 @@ def test_the_critics_gradient_is_clipped_and_no_other(
     state, way, _ = trained(finished, tmp_path / "clipped", "bcq.critic_grad_clip=1e-12")
     whole, whole_way, _ = trained(finished, tmp_path / "whole")
     assert way < 1e-4 < whole_way
-    generator = [key for key in state["loss"] if key.startswith("generator_params")]
-    assert all(torch.equal(state["loss"][key], whole["loss"][key]) for key in generator)
+    generator = [key for key in state["module"] if key.startswith("generator_params")]
+    assert all(torch.equal(state["module"][key], whole["module"][key]) for key in generator)
 
 
 @pytest.mark.robosuite
 @pytest.mark.slow
-@pytest.mark.parametrize(("update", "kept"), [(3, None), (6, 4), (12, 8)])
+@pytest.mark.parametrize(("update", "kept"), [(3, None), (6, 4), (12, 12)])
 def test_stage_2_resumed_equals_never_stopped(
     run: Run, finished: Path, tmp_path: Path, update: int, kept: int | None
 ) -> None:
@@ -825,7 +773,8 @@ def test_stage_2_resumed_equals_never_stopped(
     counted: list[int] = []
     distill.train_student(config, counted.append)
     assert counted == ([kept] if kept else []) + [1] * (12 - (kept or 0))
-    stages = ("bcq/*/*", "distill/*")  # the teachers are as they were, too
+    # The teachers are as they were, too.
+    stages = ("bcq/*/*", "distill/*", "logs/distill/scalars/*")
     assert contents(tmp_path, *stages) == contents(finished, *stages)
 
 

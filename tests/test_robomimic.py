@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -564,6 +565,54 @@ def test_damage_is_answered_with_file_key_and_what_is_valid(path: Path, name: st
     assert error.key == key
     assert f"{path}: {key}: " in str(error)
     assert says in str(error)
+
+
+def elsewhere(path: Path) -> Path:
+    """Another file with what an episode's actions may be."""
+    other = path.with_name("other.hdf5")
+    with h5py.File(other, "w") as file:
+        file["actions"] = np.zeros((ROWS, 7))
+    return other
+
+
+def linked(demo: h5py.Group, other: Path) -> None:
+    demo["actions"] = h5py.ExternalLink(other, "/actions")
+
+
+def stored_outside(demo: h5py.Group, other: Path) -> None:
+    demo.create_dataset("actions", (ROWS, 7), "u1", external=[(str(other), 0, ROWS * 7)])
+
+
+def virtual(demo: h5py.Group, other: Path) -> None:
+    layout = h5py.VirtualLayout((ROWS, 7), "f8")
+    layout[:] = h5py.VirtualSource(other, "actions", (ROWS, 7))
+    demo.create_virtual_dataset("actions", layout)
+
+
+def enormous(demo: h5py.Group, other: Path) -> None:
+    options = {"chunks": (1024, 7), "fillvalue": 0.5}
+    demo.create_dataset("actions", (10**12, 7), "f8", **options)
+
+
+@pytest.mark.parametrize(
+    ("put_actions", "says"),
+    [
+        (linked, "lies in .*other.hdf5; valid: in this file"),
+        (stored_outside, "its content lies in other files"),
+        (virtual, "its content lies in other files"),
+        (enormous, "claims 56000000000000 bytes, more than the file can hold"),
+    ],
+)
+def test_what_lies_in_another_file_or_is_larger_than_its_own_is_not_read(
+    path: Path, put_actions: Any, says: str
+) -> None:
+    other = elsewhere(path)
+    with h5py.File(path, "r+") as file:
+        del file[DEMO]["actions"]
+        put_actions(file[DEMO], other)
+    error = refusal(path)
+    assert error.key == f"{DEMO}/actions"
+    assert re.search(says, str(error))
 
 
 @pytest.mark.parametrize("rows", [ROWS - 1, ROWS + 1])

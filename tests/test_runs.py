@@ -19,10 +19,9 @@ pytest.importorskip("yaml")
 import yaml
 
 from torchrl_bmrl import __version__, runs
-from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
+from torchrl_bmrl.errors import ConfigError, DataError, UnknownNameError
 from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.runs import (
-    check_finite,
     log_metrics,
     make_logger,
     open_run,
@@ -250,7 +249,25 @@ def test_a_folder_without_readable_settings_is_refused_by_name(
     assert info.value.path == path
 
 
-@pytest.mark.parametrize("text", [None, "{", ""])
+def test_settings_that_refer_to_each_other_are_refused_before_they_grow(tmp_path: Path) -> None:
+    lines = ["a0: &a0 {x: 1}"]
+    lines += [f"a{i}: &a{i} {{x: *a{i - 1}, y: *a{i - 1}}}" for i in range(1, 60)]
+    (tmp_path / "config.yaml").write_text("\n".join(lines))
+    with pytest.raises(DataError, match=r"config\.yaml: not YAML \(a reference; valid"):
+        read_settings(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "a: " + "{a: " * 5_000, "\udc80"])
+def test_settings_and_versions_of_any_content_are_refused_by_name(
+    tmp_path: Path, text: str
+) -> None:
+    for name, read in (("config.yaml", read_settings), ("versions.json", read_versions)):
+        (tmp_path / name).write_bytes(text.encode("utf-8", "surrogateescape"))
+        with pytest.raises(DataError, match=name):
+            read(tmp_path)
+
+
+@pytest.mark.parametrize("text", [None, "{", "", "[1, 2]"])
 def test_a_folder_without_readable_versions_is_refused_by_name(
     tmp_path: Path, text: str | None
 ) -> None:
@@ -325,13 +342,62 @@ def test_an_unknown_logger_is_refused_with_the_valid_ones(tmp_path: Path) -> Non
         make_logger("mlflow", tmp_path, "bcq_lift")
 
 
-# -- metrics -----------------------------------------------------------------------------------
+# -- loggers that fail -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_a_metric_that_is_not_finite_stops_the_run_by_name(value: float) -> None:
-    metrics = {"loss_generator": torch.tensor(1.0), "loss_qvalue": torch.tensor(value)}
-    with pytest.raises(BMRLError, match=r"bcq lift, update 100: loss_qvalue is (nan|-?inf)"):
-        check_finite(metrics, "bcq lift, update 100")
-    metrics.pop("loss_qvalue")
-    check_finite(metrics, "bcq lift, update 100")
+@pytest.mark.parametrize("kind", ["tensorboard", "wandb"])
+def test_a_logger_that_cannot_be_made_is_said_and_csv_files_take_its_place(
+    tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import torchrl.record.loggers as loggers
+
+    make = loggers.get_logger
+
+    def unreachable(name: str, *arguments: Any, **options: Any) -> Any:
+        if name == kind:
+            raise ConnectionError("no route to host\nand much more")
+        return make(name, *arguments, **options)
+
+    monkeypatch.setattr(loggers, "get_logger", unreachable)
+    monkeypatch.setattr(runs, "_wandb_options", lambda run_dir: {})
+    logger = make_logger(kind, tmp_path, "bcq_lift")
+    log_metrics(logger, {"loss": 0.5}, 10)
+    said = capsys.readouterr().err
+    assert f"bcq_lift: no {kind} (no route to host); metrics go to CSV files in {tmp_path}" in said
+    assert said.count("\n") == 1
+    assert (tmp_path / "logs" / "bcq_lift" / "scalars" / "loss.csv").read_text() == "10,0.5\n"
+
+
+def test_a_logger_that_fails_later_is_said_once_and_the_run_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logger = make_logger("csv", tmp_path, "bcq_lift")
+    log_metrics(logger, {"loss": 0.5}, 10)
+    with monkeypatch.context() as patch:
+        fails = Mock(side_effect=OSError("no space left on device"))
+        patch.setattr(logger, "log_scalar", fails)
+        for step in (20, 30):
+            log_metrics(logger, {"loss": 0.5, "accuracy": 1}, step)
+    assert fails.call_count == 1
+    said = capsys.readouterr().err
+    assert said == "metrics are logged no more, from step 20 on (no space left on device)\n"
+    other = make_logger("csv", tmp_path, "bcq_reach")
+    log_metrics(other, {"loss": 0.5}, 10)
+    assert (tmp_path / "logs" / "bcq_reach" / "scalars" / "loss.csv").exists()
+
+
+@pytest.mark.parametrize("torn", ["", "4", "40,0.", "\0\0\0\n", "40,0.25"])
+def test_rows_after_the_step_that_a_run_goes_on_from_are_dropped_and_torn_ones(
+    tmp_path: Path, torn: str
+) -> None:
+    logger = make_logger("csv", tmp_path, "bcq_lift")
+    for step in (10, 20, 30):
+        log_metrics(logger, {"loss": step / 4}, step)
+    del logger
+    path = tmp_path / "logs" / "bcq_lift" / "scalars" / "loss.csv"
+    whole = path.read_text()
+    path.write_text(whole + torn)
+    logger = make_logger("csv", tmp_path, "bcq_lift", step=20)
+    for step in (30, 40):
+        log_metrics(logger, {"loss": step / 4}, step)
+    assert path.read_text() == whole + "40,10.0\n"

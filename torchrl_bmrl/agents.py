@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import reprlib
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +13,8 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.transforms import Transform
 
-from torchrl_bmrl.checkpoint import load_checkpoint, load_state
-from torchrl_bmrl.errors import UnknownNameError
+from torchrl_bmrl.checkpoint import build, load_checkpoint
+from torchrl_bmrl.errors import CheckpointError, UnknownNameError
 from torchrl_bmrl.modules import (
     ActionVAE,
     BCQPolicy,
@@ -27,6 +29,7 @@ from torchrl_bmrl.modules import (
     make_task_encoder,
     prototype,
 )
+from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.objectives import BCQLoss, MetaDistillationLoss
 
 OBSERVATION_DIM, ACTION_DIM = 33, 7
@@ -72,9 +75,7 @@ def load_bcq_loss(path: Path) -> tuple[BCQLoss, dict[str, Any]]:
         CheckpointError: if the file is missing, damaged, of another kind or of other shapes.
     """
     state, metadata = load_checkpoint(path, kind="bcq")
-    loss = make_bcq_loss(**metadata["loss"])
-    load_state(loss, state["loss"], path)
-    return loss.requires_grad_(False), metadata
+    return build(make_bcq_loss, metadata.get("loss"), state, path), metadata
 
 
 class Student(nn.Module):
@@ -210,10 +211,47 @@ TASK_ENCODERS = ("transition", "one_hot")
 def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
     """A distilled student and its checkpoint's metadata.
 
+    Args:
+        path: the checkpoint.
+
+    Returns:
+        the student, and what was said of it; of that ``tasks``, ``latent_clip``, ``accuracy`` and
+        ``statistics`` are checked.
+
     Raises:
-        CheckpointError: if the file is missing, damaged, of another kind or of other shapes.
+        CheckpointError: if the file is missing, damaged, of another kind or of other shapes, or
+            says something that is not valid.
     """
     state, metadata = load_checkpoint(path, kind="student")
-    student = Student(**metadata["student"])
-    load_state(student, state["student"], path)
-    return student.requires_grad_(False), metadata
+    student = build(Student, metadata.get("student"), state, path)
+    number = len(student.prototypes)
+    valid: dict[str, tuple[Callable[[Any], bool], str]] = {
+        "tasks": (
+            lambda x: isinstance(x, list) and len(x) == number and all(y in TASKS for y in x),
+            f"{number} of {', '.join(TASKS)}, one per prototype",
+        ),
+        "latent_clip": (lambda x: x is None or (_is_number(x) and x > 0), "a number above 0, null"),
+        "accuracy": (lambda x: _is_number(x) and 0 <= x <= 1, "a number between 0 and 1"),
+        "statistics": (_are_statistics, "loc and scale, as many numbers in each, scale above 0"),
+    }
+    for key, (holds, what) in valid.items():
+        if not holds(metadata.get(key)):
+            said = reprlib.repr(metadata.get(key))
+            raise CheckpointError(path, f"{key} is {said}; valid: {what}")
+    return student, metadata
+
+
+def _is_number(x: Any) -> bool:
+    return isinstance(x, float | int) and math.isfinite(x)
+
+
+def _are_statistics(x: Any) -> bool:
+    if not isinstance(x, dict) or set(x) != {"loc", "scale"}:
+        return False
+    lists = isinstance(x["loc"], list) and isinstance(x["scale"], list)
+    return (
+        lists
+        and len(x["loc"]) == len(x["scale"])
+        and all(map(_is_number, [*x["loc"], *x["scale"]]))
+        and all(scale > 0 for scale in x["scale"])
+    )

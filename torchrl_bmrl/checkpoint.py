@@ -2,31 +2,49 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Mapping
+import os
+import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import safetensors
 import safetensors.torch
+import tensordict
 import torch
+import torchrl
 from torch import Tensor, nn
+from torch.optim import Adam
 
+from torchrl_bmrl import __version__
 from torchrl_bmrl.errors import CheckpointError
-from torchrl_bmrl.files import write_atomic
+from torchrl_bmrl.files import link_or_copy, write_atomic
+from torchrl_bmrl.training import get_rng_state, load_adam, set_rng_state
 
-_HEADER = "checkpoint"
+_HEADER, _SUM = "checkpoint", "sha256"
 _TENSOR, _PAIRS = "__tensor__", "__pairs__"
 
+State = dict[str, Any]
+Metadata = dict[str, Any]
 
-def save_checkpoint(path: Path, state: Mapping[str, Any], metadata: Mapping[str, Any]) -> None:
+
+def save_checkpoint(
+    path: Path, state: Mapping[str, Any], metadata: Mapping[str, Any], *, keep: int = 1
+) -> None:
     """Saves nested state dicts and what is needed to build what they belong to.
+
+    The file also holds a checksum of everything in it and, under ``metadata["versions"]`` unless
+    there is such an entry, the versions of what wrote it.
 
     Args:
         path: the file.
         state: nested dicts and lists of tensors and plain values, such as ``state_dict()`` of
             modules and optimizers.
         metadata: JSON-compatible description, read back by :func:`load_checkpoint`.
+        keep: checkpoints to keep, this one and those before it: ``a.safetensors`` is the newest,
+            ``a.1.safetensors`` the one before.
 
     Example:
         >>> import tempfile
@@ -35,13 +53,48 @@ def save_checkpoint(path: Path, state: Mapping[str, Any], metadata: Mapping[str,
         >>> load_checkpoint(path, kind="example")[0]
         {'step': 3, 'weights': tensor([1., 1.])}
     """
-    tensors: dict[str, Tensor] = {}
-    header = {"state": _encode(state, "", tensors), "metadata": dict(metadata)}
+    path, tensors = Path(path), dict[str, Tensor]()
+    header = {"state": _encode(state, "", tensors), "metadata": {"versions": _VERSIONS, **metadata}}
+    header[_SUM] = _checksum(header, tensors)
     # One entry: safetensors orders several at random, and equal runs would differ in bytes.
-    write_atomic(path, safetensors.torch.save(tensors, {_HEADER: json.dumps(header)}))
+    data = safetensors.torch.save(tensors, {_HEADER: json.dumps(header)})
+    if keep > 1 and path.exists():
+        for number in range(keep - 1, 1, -1):
+            if (newer := earlier(path, number - 1)).exists():
+                newer.replace(earlier(path, number))
+        # A second name: killed at any moment, the newest one is there.
+        earlier(path, 1).unlink(missing_ok=True)
+        link_or_copy(path, earlier(path, 1))
+    write_atomic(path, data)
 
 
-def load_checkpoint(path: Path, *, kind: str) -> tuple[dict[str, Any], dict[str, Any]]:
+def earlier(path: Path, number: int) -> Path:
+    """Where the checkpoint is kept that came so many before the newest.
+
+    Example:
+        >>> earlier(Path("run/checkpoint.safetensors"), 1).name
+        'checkpoint.1.safetensors'
+    """
+    return path.with_name(f"{path.stem}.{number}{path.suffix}")
+
+
+_VERSIONS = {
+    "torchrl_bmrl": __version__,
+    "torch": torch.__version__,
+    "tensordict": tensordict.__version__,
+    "torchrl": torchrl.__version__,
+}
+
+
+def _checksum(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> str:
+    """Of all that a checkpoint holds but its checksum."""
+    said = json.dumps({key: value for key, value in header.items() if key != _SUM})
+    digest = hashlib.sha256(said.encode())
+    digest.update(safetensors.torch.save(dict(tensors)))
+    return digest.hexdigest()
+
+
+def load_checkpoint(path: Path, *, kind: str) -> tuple[State, Metadata]:
     """Reads what :func:`save_checkpoint` wrote.
 
     Args:
@@ -54,42 +107,236 @@ def load_checkpoint(path: Path, *, kind: str) -> tuple[dict[str, Any], dict[str,
     Raises:
         CheckpointError: if the file is missing, damaged, a pickle, or of another kind.
     """
+    state, metadata = _read(Path(path))
+    return state, _of_kind(path, metadata, kind)
+
+
+def load_newest(path: Path, *, kind: str) -> tuple[State, Metadata] | None:
+    """What training goes on from: the newest checkpoint, or the one before if that is damaged.
+
+    A damaged checkpoint is reported on stderr and set aside as ``a.damaged.safetensors``, and the
+    one that is used becomes the newest.
+
+    Args:
+        path: the newest checkpoint.
+        kind: expected ``metadata["kind"]``.
+
+    Returns:
+        state and metadata; ``None`` if nothing was kept.
+
+    Raises:
+        CheckpointError: if all that were kept are damaged, or of another kind; what was kept stays.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "a.safetensors"
+        >>> load_newest(path, kind="example")
+        >>> for step in range(3):
+        ...     save_checkpoint(path, {"step": step}, {"kind": "example"}, keep=2)
+        >>> path.write_bytes(b"damaged")
+        7
+        >>> load_newest(path, kind="example")[0]
+        {'step': 1}
+    """
     path = Path(path)
+    pattern = f"{path.stem}.*{path.suffix}"
+    numbers = [
+        file.name[len(path.stem) + 1 : -len(path.suffix)] for file in path.parent.glob(pattern)
+    ]
+    found = [earlier(path, n) for n in sorted(int(n) for n in numbers if n.isdecimal())]
+    found = [path, *found] if path.exists() else found
+    damaged: list[CheckpointError] = []
+    for file in found:
+        try:
+            state, metadata = _read(file)
+        except CheckpointError as error:
+            damaged.append(error)
+            continue
+        _of_kind(file, metadata, kind)
+        if damaged:
+            print(f"{damaged[0]}; going on from {file.name}", file=sys.stderr, flush=True)
+            for bad in damaged:
+                os.replace(bad.path, path.with_name(f"{path.stem}.damaged{path.suffix}"))
+        if file != path:
+            file.replace(path)
+        return state, metadata
+    if damaged:
+        raise damaged[0]
+    return None
+
+
+def _read(path: Path) -> tuple[State, Metadata]:
     if not path.is_file():
         raise CheckpointError(path, "no such checkpoint")
     try:
         with safetensors.safe_open(path, "pt") as file:
             header = json.loads((file.metadata() or {})[_HEADER])
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        metadata = header["metadata"]
-        state = _decode(header["state"], tensors)
-    except (safetensors.SafetensorError, KeyError, ValueError, OSError) as error:
+        if header[_SUM] != _checksum(header, tensors):
+            raise ValueError("its checksum differs")
+        state, metadata = _decode(header["state"], tensors), header["metadata"]
+        if not isinstance(state, dict) or not isinstance(metadata, dict):
+            raise ValueError("its state and what it says of it are no mappings")
+        return state, metadata
+    except (
+        safetensors.SafetensorError,
+        AttributeError,
+        KeyError,
+        OSError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as error:
         raise CheckpointError(
             path, f"not a whole checkpoint of this library in safetensors format ({error})"
         ) from error
+
+
+def _of_kind(path: Path, metadata: Metadata, kind: str) -> Metadata:
     if metadata.get("kind") != kind:
         raise CheckpointError(path, f"kind is {metadata.get('kind')!r}; valid: {kind!r}")
-    return state, metadata
+    return metadata
 
 
 def load_state(module: nn.Module, state: Mapping[str, Tensor], path: Path) -> None:
     """Loads a module's state and names the first key or shape that does not fit.
 
     Raises:
-        CheckpointError: if keys or shapes differ.
+        CheckpointError: if keys or shapes differ; nothing is loaded.
     """
     own = module.state_dict()
+    if not isinstance(state, Mapping):
+        raise CheckpointError(path, f"holds {type(state).__name__}; valid: parameters by name")
     for key in [*own, *state]:
         if key not in state or key not in own:
             where = "checkpoint" if key not in state else "networks"
             raise CheckpointError(path, f"key {key!r} is missing in the {where}")
-        if isinstance(own[key], Tensor) and own[key].shape != state[key].shape:
+        if not isinstance(own[key], Tensor):
+            continue
+        if not isinstance(state[key], Tensor) or own[key].shape != state[key].shape:
+            shape = tuple(state[key].shape) if isinstance(state[key], Tensor) else "none"
             raise CheckpointError(
                 path,
-                f"{key!r} has shape {tuple(state[key].shape)}; "
-                f"valid for these networks: {tuple(own[key].shape)}",
+                f"{key!r} has shape {shape}; valid for these networks: {tuple(own[key].shape)}",
             )
     module.load_state_dict(dict(state))
+
+
+Built = TypeVar("Built", bound=nn.Module)
+
+
+def build(make: Callable[..., Built], options: Any, state: Mapping[str, Any], path: Path) -> Built:
+    """Networks as a checkpoint says that they are, with its parameters, not to be trained.
+
+    Args:
+        make: makes the networks of the options.
+        options: its keyword arguments, as the checkpoint's metadata have them.
+        state: of the checkpoint, the parameters under ``module``.
+        path: of the checkpoint, for the message.
+
+    Raises:
+        CheckpointError: if the options are none of ``make``, or do not belong to the parameters, or
+            these are not finite.
+    """
+    params = state.get("module")
+    if not isinstance(options, dict) or not isinstance(params, dict):
+        raise CheckpointError(path, "says nothing of its networks; valid: a trained module")
+    # Whoever wrote the file decides how much memory the networks take: no more than what is in it.
+    tensors = [value for value in params.values() if isinstance(value, Tensor)]
+    largest = max((size for tensor in tensors for size in tensor.shape), default=0)
+    for name, option in options.items():
+        sizes = option if isinstance(option, list) else [option]
+        whole = [size for size in sizes if isinstance(size, int)]
+        if len(sizes) > len(tensors) or any(abs(size) > largest for size in whole):
+            raise CheckpointError(path, f"{name} is {option}; no tensor in the file is that large")
+    try:
+        module = make(**options)
+    except (AttributeError, RuntimeError, TypeError, ValueError) as error:
+        raise CheckpointError(path, f"not the settings of networks ({error})") from error
+    load_state(module, params, path)
+    for key, tensor in params.items():
+        if not tensor.isfinite().all():
+            raise CheckpointError(path, f"{key!r} holds numbers that are not finite")
+    return module.requires_grad_(False)
+
+
+def keep_training(
+    path: Path,
+    module: nn.Module,
+    optimizers: Mapping[str, Adam],
+    metadata: Mapping[str, Any],
+    *,
+    device: str,
+    keep: int,
+) -> None:
+    """Saves what a training goes on from: parameters, optimizers, and random numbers.
+
+    Args:
+        path: of the newest checkpoint.
+        module: what is trained.
+        optimizers: its optimizers by name.
+        metadata: of :func:`save_checkpoint`, with ``updates``.
+        device: that trains.
+        keep: checkpoints to keep, this one and those before it.
+    """
+    state = {
+        "module": module.state_dict(),
+        "optimizers": {name: optimizer.state_dict() for name, optimizer in optimizers.items()},
+        "rng": get_rng_state(device),
+    }
+    save_checkpoint(path, state, metadata, keep=keep)
+
+
+def resume_training(
+    path: Path,
+    module: nn.Module,
+    optimizers: Mapping[str, Adam],
+    *,
+    kind: str,
+    device: str,
+) -> dict[str, Any] | None:
+    """Goes on from what :func:`keep_training` saved, or from the one before if that is damaged.
+
+    Args:
+        path: of the newest checkpoint.
+        module: takes over the parameters.
+        optimizers: take over their state.
+        kind: expected ``metadata["kind"]``.
+        device: that trains.
+
+    Returns:
+        the metadata; ``None`` if nothing was kept.
+
+    Raises:
+        CheckpointError: if what was kept is damaged, or belongs to another training.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "a.safetensors"
+        >>> from torchrl_bmrl.training import make_adam
+        >>> net = nn.Linear(2, 1)
+        >>> optimizers = {"net": make_adam(net.parameters(), lr=0.1)}
+        >>> resume_training(path, net, optimizers, kind="example", device="cpu")
+        >>> said = {"kind": "example", "updates": 3}
+        >>> keep_training(path, net, optimizers, said, device="cpu", keep=2)
+        >>> resume_training(path, net, optimizers, kind="example", device="cpu")["updates"]
+        3
+    """
+    found = load_newest(path, kind=kind)
+    if found is None:
+        return None
+    state, metadata = found
+    try:
+        load_state(module, state["module"], path)
+        for name, optimizer in optimizers.items():
+            load_adam(optimizer, state["optimizers"][name])
+        set_rng_state(state["rng"], device)
+        metadata["updates"] = int(metadata["updates"])
+    except CheckpointError:
+        raise
+    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        raise CheckpointError(path, f"not what this training goes on from ({error})") from error
+    return metadata
 
 
 def _encode(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:

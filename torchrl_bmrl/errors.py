@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -115,6 +116,51 @@ class RenderError(BMRLError):
 
     def __str__(self) -> str:
         return f"no pictures can be rendered here ({'; '.join(self.problems)})"
+
+
+class FolderInUseError(BMRLError):
+    """A run folder that another process works in.
+
+    Args:
+        folder: the folder.
+        process: number of the process that holds it.
+        host: the machine that it runs on.
+
+    Example:
+        >>> print(FolderInUseError("runs/a", 4711, "node3"))
+        runs/a: in use by process 4711 on node3; wait for it, or give another run_dir
+    """
+
+    def __init__(self, folder: str | Path, process: int | str, host: str) -> None:
+        self.folder = Path(folder)
+        self.process = process
+        self.host = host
+        super().__init__(folder, process, host)
+
+    def __str__(self) -> str:
+        return (
+            f"{self.folder}: in use by process {self.process} on {self.host}; wait for it, or give "
+            "another run_dir"
+        )
+
+
+class StoppedError(BMRLError):
+    """A run that was asked to stop.
+
+    Args:
+        signal: that asked.
+
+    Example:
+        >>> print(StoppedError(signal.SIGTERM))
+        stopped by SIGTERM; what was done is kept, the same command goes on
+    """
+
+    def __init__(self, signal: signal.Signals) -> None:
+        self.signal = signal
+        super().__init__(signal)
+
+    def __str__(self) -> str:
+        return f"stopped by {self.signal.name}; what was done is kept, the same command goes on"
 
 
 def _plural(noun: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 import os
 import shutil
@@ -86,6 +87,31 @@ def write_atomic(path: str | os.PathLike[str], data: str | bytes, *, replace: bo
         temporary.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
 
 
+def link_or_copy(source: Path, target: Path) -> None:
+    """Gives a file a second name, or a copy on another disk.
+
+    A file is replaced, never changed, so it may have two names.
+
+    Args:
+        source: a file.
+        target: must not exist; its folder is created if missing.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> write_atomic(folder / "a", "1")
+        >>> link_or_copy(folder / "a", folder / "b")
+        >>> (folder / "b").read_text()
+        '1'
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        with atomic_path(target) as path:
+            shutil.copyfile(source, path)
+
+
 @contextmanager
 def new_folder(path: str | os.PathLike[str], *, exist_ok: bool = False) -> Iterator[Path]:
     """Yields a temporary folder that becomes ``path`` when the block succeeds.
@@ -127,6 +153,29 @@ def new_folder(path: str | os.PathLike[str], *, exist_ok: bool = False) -> Itera
                 raise
     finally:  # after an interrupt, too
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def read_json(path: str | os.PathLike[str], what: str) -> Any:
+    """The content of a JSON file.
+
+    Args:
+        path: The file.
+        what: What it should hold, for the message.
+
+    Raises:
+        DataError: if it is missing, damaged or nested beyond reason.
+
+    Example:
+        >>> import tempfile
+        >>> file = Path(tempfile.mkdtemp()) / "a.json"
+        >>> write_atomic(file, "[1, 2]")
+        >>> read_json(file, "two numbers")
+        [1, 2]
+    """
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(Path(path), None, f"not {what} ({error})") from error
 
 
 def write_rows(path: str | os.PathLike[str], rows: Sequence[Mapping[str, Any]]) -> None:
@@ -177,14 +226,16 @@ def read_rows(
     path = Path(path)
     if not path.is_file():
         raise DataError(path, None, f"no such file; expected a CSV with {', '.join(columns)}")
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        for column in columns:
-            if column not in (reader.fieldnames or ()):
-                raise DataError(
-                    path, column, f"column is missing; expected the columns {', '.join(columns)}"
-                )
-        return [parse_row(record, columns, path, reader.line_num) for record in reader]
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            for column in columns:
+                if column not in (reader.fieldnames or ()):
+                    message = f"column is missing; expected the columns {', '.join(columns)}"
+                    raise DataError(path, column, message)
+            return [parse_row(record, columns, path, reader.line_num) for record in reader]
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise DataError(path, None, f"not a CSV file ({error})") from error
 
 
 def parse_row(
@@ -237,6 +288,22 @@ def whole(text: str) -> int:
         raise ValueError("a whole number") from None
 
 
+def number(text: str) -> float:
+    """A number; not finite ones are "nan" and "inf".
+
+    Raises:
+        ValueError: if the text is none.
+
+    Example:
+        >>> number("nan")
+        nan
+    """
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError("a number") from None
+
+
 def finite(text: str) -> float:
     """A finite number.
 
@@ -248,12 +315,12 @@ def finite(text: str) -> float:
         0.001
     """
     try:
-        number = float(text)
+        value = float(text)
     except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
+        value = math.nan
+    if not math.isfinite(value):
         raise ValueError("a finite number")
-    return number
+    return value
 
 
 def one_of(*valid: str) -> Callable[[str], str]:

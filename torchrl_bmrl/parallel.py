@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 import threading
+import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
@@ -19,15 +20,24 @@ from typing import Any, TypeVar
 import torch
 from tqdm import tqdm
 
-from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.errors import BMRLError, StoppedError
+from torchrl_bmrl.stops import check_stop, note_signal
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 Report = Callable[[int], None]
-"""Called by a job with the number of units that it has finished since its last call."""
+"""Called by a job with the number of units that it has finished since its last call.
+
+It raises :class:`~torchrl_bmrl.errors.StoppedError` when the run was asked to stop: a job that has
+more than its last checkpoint catches it, keeps what it has and raises it again.
+"""
 
 TRIES = 3
 """So often is a job begun whose worker dies."""
+SILENCE = 900.0
+"""Seconds without a word after which a worker is taken to hang. Compiling takes one of minutes."""
+GRACE = 60.0
+"""Seconds that workers have to keep what they did when a run stops."""
 
 
 def available_cores() -> int:
@@ -56,8 +66,12 @@ def run_jobs(
     With more than one worker the jobs run in freshly spawned processes, so ``function`` and the
     jobs must be importable by name. Every job runs on one thread, whatever the number of workers.
 
-    A worker that dies (killed for memory, say) is reported and replaced, and its job done again: a
-    job must be one that can be, from the start or from what it kept.
+    A worker that dies (killed for memory, say), or says nothing for :data:`SILENCE` seconds and so
+    is killed, is reported and replaced, and its job done again: a job must be one that can be, from
+    the start or from what it kept. What runs here, with one worker, is not watched.
+
+    Asked to stop (:func:`~torchrl_bmrl.stops.stop_on_signals`), every job stops at its next report;
+    so do the other jobs when one fails.
 
     Args:
         function: what to do with a job; it calls ``report(n)`` as it advances.
@@ -69,6 +83,7 @@ def run_jobs(
 
     Raises:
         BMRLError: if a job's workers die three times.
+        StoppedError: if the run was asked to stop.
 
     Example:
         >>> run_jobs(
@@ -81,10 +96,15 @@ def run_jobs(
         return []
     with tqdm(total=total, desc=description, unit=unit, disable=None) as bar:
         if min(workers, len(jobs)) <= 1:
+
+            def report(units: int) -> None:
+                bar.update(units)
+                check_stop()
+
             threads = torch.get_num_threads()
             torch.set_num_threads(1)
             try:
-                return [function(job, bar.update) for job in jobs]
+                return [function(job, report) for job in jobs]
             finally:
                 torch.set_num_threads(threads)
         with _one_thread_each():
@@ -115,25 +135,50 @@ class _Worker:
         theirs.close()  # so that the process's end closes the pipe
         self.job = -1  # its number
         self.units = 0  # that the job has reported
+        self.heard = time.monotonic()
+        self.hangs = False
 
     def begin(self, number: int, job: Any) -> None:
-        self.job, self.units = number, 0
+        self.job, self.units, self.heard = number, 0, time.monotonic()
+        self._send(("job", job))
+
+    def end(self) -> None:
+        """Asks it to end: at its job's next report, or where it waits for a job."""
+        self.process.terminate()
+        self._send(("end", None))
+
+    def _send(self, message: tuple[str, Any]) -> None:
         with suppress(OSError):  # if it is dead already, its connection says so next
-            self.connection.send(job)
+            self.connection.send(message)
+
+    def kill_if_it_hangs(self) -> None:
+        if time.monotonic() - self.heard > SILENCE:
+            self.hangs = True
+            self.process.kill()
 
 
 def _serve(connection: Connection, function: Callable[[Job, Report], Result]) -> None:
     """A worker's life: jobs in, reports and results out."""
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's
+    signal.signal(signal.SIGTERM, note_signal)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+
+    def report(units: int) -> None:
+        connection.send(("report", units))
+        check_stop()
+
     while True:
         try:
-            job = connection.recv()
+            kind, job = connection.recv()
         except EOFError:
             return
+        if kind == "end":
+            return
         try:
-            connection.send(("result", function(job, lambda n: connection.send(("report", n)))))
+            connection.send(("result", function(job, report)))
+        except StoppedError:
+            return
         except Exception as error:
             connection.send(("error", (error, traceback.format_exc())))
 
@@ -162,9 +207,13 @@ def _run_in_processes(
                 pool.append(_Worker(function))
                 pool[-1].begin(number := waiting.popleft(), jobs[number])
             by_connection: dict[Any, _Worker] = {worker.connection: worker for worker in pool}
-            for connection in wait(list(by_connection)):
+            ready = wait(list(by_connection), timeout=1.0)
+            check_stop()
+            for worker in pool:
+                worker.kill_if_it_hangs()
+            for connection in ready:
                 worker = by_connection[connection]
-                number = worker.job
+                number, worker.heard = worker.job, time.monotonic()
                 try:
                     kind, value = worker.connection.recv()
                 except (EOFError, OSError):
@@ -198,12 +247,18 @@ def _run_in_processes(
         return [results[number] for number in range(len(jobs))]
     finally:
         for worker in pool:
-            worker.process.terminate()
+            worker.end()  # it keeps what it did
+        end = time.monotonic() + GRACE
+        for worker in pool:
+            worker.process.join(max(0.0, end - time.monotonic()))
+            worker.process.kill()
             worker.process.join()
 
 
 def _death(worker: _Worker) -> str:
     worker.process.join()
+    if worker.hangs:
+        return f"said nothing for {SILENCE:.0f} s and was killed"
     code = worker.process.exitcode or 0
     return f"was killed by signal {-code} (out of memory?)" if code < 0 else f"ended, code {code},"
 

@@ -7,17 +7,18 @@ import json
 import math
 import os
 import platform
-import shutil
 import subprocess
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
+from weakref import WeakSet
 
 import yaml
 
 from torchrl_bmrl import __version__
-from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
-from torchrl_bmrl.files import atomic_path, write_atomic
+from torchrl_bmrl.errors import ConfigError, DataError, UnknownNameError
+from torchrl_bmrl.files import link_or_copy, read_json, write_atomic
 
 FREE_TO_CHANGE = (
     "run_dir",
@@ -28,6 +29,7 @@ FREE_TO_CHANGE = (
     "only",
     "stepper",
     "logger",
+    "keep_checkpoints",
     "imitate",
     "interpolation",
     "latent_sac",
@@ -113,18 +115,13 @@ def deciding(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _adopt(run_dir: Path, base: Path, patterns: Iterable[str]) -> None:
-    """Links another run's files: a file is replaced, never changed, so it may have two names."""
+    """Takes another run's files."""
     for pattern in patterns:
         for source in base.glob(pattern):
             target = run_dir / source.relative_to(base)
             if target.exists():  # another process has made it already
                 continue
-            target.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                os.link(source, target)
-            except OSError:  # on another disk
-                with atomic_path(target) as path:
-                    shutil.copyfile(source, path)
+            link_or_copy(source, target)
 
 
 def read_settings(run_dir: Path) -> dict[str, Any]:
@@ -137,12 +134,21 @@ def read_settings(run_dir: Path) -> dict[str, Any]:
     if not path.is_file():
         raise DataError(path, None, "no such file; valid: the folder of a run")
     try:
-        settings = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
+        settings = yaml.load(path.read_text(encoding="utf-8"), _Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise DataError(path, None, f"not YAML ({error})") from error
     if not isinstance(settings, dict):
         raise DataError(path, None, "not a mapping of settings")
     return settings
+
+
+class _Loader(yaml.SafeLoader):
+    """Without references: a few lines of them grow to more than any memory."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("a reference; valid: settings written out")
+        return super().compose_node(parent, index)
 
 
 def read_versions(run_dir: Path) -> dict[str, str]:
@@ -152,10 +158,10 @@ def read_versions(run_dir: Path) -> dict[str, str]:
         DataError: if the folder has no ``versions.json``, or it is damaged.
     """
     path = run_dir / "versions.json"
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise DataError(path, None, f"not the versions of a run ({error})") from error
+    versions = read_json(path, "the versions of a run")
+    if not isinstance(versions, dict):
+        raise DataError(path, None, f"a {type(versions).__name__}; valid: versions by name")
+    return {name: str(version) for name, version in versions.items()}
 
 
 def _version(package: str) -> str | None:
@@ -188,13 +194,17 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield f"{prefix}{key}", value
 
 
-def make_logger(kind: str, run_dir: Path, name: str) -> Any:
+def make_logger(kind: str, run_dir: Path, name: str, step: int = 0) -> Any:
     """One of TorchRL's loggers, writing under ``run_dir/logs``.
+
+    A logger that cannot be made, say because its server cannot be reached, is reported on stderr
+    and replaced by the one that writes CSV files.
 
     Args:
         kind: ``"csv"``, ``"wandb"``, ``"tensorboard"`` or ``"none"``.
         run_dir: the run folder.
         name: of the experiment, such as ``"bcq_lift"``.
+        step: that the run goes on from. CSV rows after it are dropped: they come again.
 
     Returns:
         a :class:`torchrl.record.loggers.Logger`, or ``None`` for ``"none"``. Weights & Biases runs
@@ -209,37 +219,56 @@ def make_logger(kind: str, run_dir: Path, name: str) -> Any:
         return None
     from torchrl.record.loggers import get_logger
 
-    options: dict[str, Any] = {}
-    if kind == "wandb":
-        import wandb
+    folder = run_dir / "logs"
+    if kind != "csv":
+        try:
+            options = {"wandb_kwargs": _wandb_options(run_dir)} if kind == "wandb" else {}
+            return get_logger(kind, str(folder), name, **options)
+        except Exception as error:  # whatever a server or its library may come up with
+            _say(f"{name}: no {kind} ({_first_line(error)}); metrics go to CSV files in {folder}")
+    for path in (folder / name / "scalars").glob("*.csv"):
+        rows = path.read_text(encoding="utf-8").splitlines(keepends=True)
+        kept = [row for row in rows if row.endswith("\n") and _step(row) <= step]
+        if kept != rows:
+            write_atomic(path, "".join(kept))
+    return get_logger("csv", str(folder), name)
 
-        mode = os.environ.get("WANDB_MODE") or ("online" if wandb.api.api_key else "offline")
-        options["wandb_kwargs"] = {"mode": mode, "project": "torchrl_bmrl", "dir": str(run_dir)}
-    return get_logger(kind, str(run_dir / "logs"), name, **options)
+
+def _wandb_options(run_dir: Path) -> dict[str, Any]:
+    import wandb
+
+    mode = os.environ.get("WANDB_MODE") or ("online" if wandb.api.api_key else "offline")
+    return {"mode": mode, "project": "torchrl_bmrl", "dir": str(run_dir)}
+
+
+def _step(row: str) -> float:
+    """Of a row of TorchRL's CSV logger; that of a damaged one is beyond all others."""
+    number = row.partition(",")[0]
+    return int(number) if number.isdecimal() else math.inf
 
 
 def log_metrics(logger: Any, metrics: Mapping[str, Any], step: int) -> None:
-    """Logs scalars under their names; does nothing without a logger."""
-    if logger is not None:
+    """Logs scalars under their names; does nothing without a logger.
+
+    A logger that fails is reported on stderr, once, and not used again.
+    """
+    if logger is None or logger in _lost:
+        return
+    try:
         for name, value in metrics.items():
             logger.log_scalar(name, float(value), step=step)
+    except Exception as error:
+        _lost.add(logger)
+        _say(f"metrics are logged no more, from step {step} on ({_first_line(error)})")
 
 
-def check_finite(metrics: Mapping[str, Any], where: str) -> None:
-    """Stops a run whose losses are not finite any more.
+_lost: WeakSet[Any] = WeakSet()
+"""Loggers that failed."""
 
-    Raises:
-        BMRLError: naming the first such metric.
 
-    Example:
-        >>> check_finite({"loss_qvalue": float("nan")}, "bcq lift, update 100")
-        Traceback (most recent call last):
-        ...
-        torchrl_bmrl.errors.BMRLError: bcq lift, update 100: loss_qvalue is nan; ...
-    """
-    for name, value in metrics.items():
-        if not math.isfinite(float(value)):
-            raise BMRLError(
-                f"{where}: {name} is {float(value)}; the last checkpoint is kept, "
-                "a lower learning rate may help"
-            )
+def _first_line(error: Exception) -> str:
+    return str(error).strip().partition("\n")[0] or type(error).__name__
+
+
+def _say(message: str) -> None:
+    print(message, file=sys.stderr, flush=True)

@@ -18,6 +18,8 @@ from hydra.core.utils import JobReturn
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
+from torchrl_bmrl.errors import StoppedError
+
 
 def run_job(main: Callable[[DictConfig], None], cwd: str, config: DictConfig) -> str | None:
     """Runs a job of a sweep, in this process or another one.
@@ -37,6 +39,8 @@ def run_job(main: Callable[[DictConfig], None], cwd: str, config: DictConfig) ->
         os.chdir(cwd)
         main(config)
     except SystemExit as stop:
+        if isinstance(stop.__cause__, StoppedError | KeyboardInterrupt):  # the whole sweep's
+            raise
         return f"error: {stop.__cause__ or stop}"
     except Exception:
         return traceback.format_exc()

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from torchrl_bmrl.command_line import exit_codes
 from torchrl_bmrl.data.convert import TARGETS, Source, convert, open_source
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robosuite import Relabelling
 from torchrl_bmrl.data.schema import Summary, summarise
-from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.names import TASKS
 
 
@@ -143,11 +143,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parts.add_argument("--fps", type=float, help="steps per second, where the source tells none")
     parts.set_defaults(run=convert_command)
     options = parser.parse_args(arguments)
-    try:
+    with exit_codes():
         return options.run(options)
-    except BMRLError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
 
 
 if __name__ == "__main__":

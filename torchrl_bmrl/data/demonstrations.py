@@ -16,7 +16,7 @@ from torchrl_bmrl.data.robomimic import open_episodes
 from torchrl_bmrl.data.schema import ACTION_DIM, OBSERVATION_SHAPES
 from torchrl_bmrl.envs.transforms import ObservationStatistics, transform_data
 from torchrl_bmrl.errors import DataError
-from torchrl_bmrl.files import write_atomic
+from torchrl_bmrl.files import read_json, write_atomic
 from torchrl_bmrl.names import TASKS, check_task
 
 
@@ -132,15 +132,16 @@ def read_statistics(data_dir: Path, task: str | None = None) -> ObservationStati
     path = data_dir / "statistics.json"
     if not path.is_file():
         raise DataError(path, None, "no such file; recipes/collect.py writes it")
+    content = read_json(path, "the statistics of a data set")
     try:
-        content = json.loads(path.read_text())
         if task is not None:
             content = content["tasks"][task]
-        loc, scale = torch.tensor(content["loc"]), torch.tensor(content["scale"])
-    except (ValueError, KeyError, TypeError) as error:
+        loc, scale = (torch.tensor(content[name], dtype=torch.float) for name in ("loc", "scale"))
+    except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise DataError(path, task, f"not the statistics of a data set ({error})") from error
-    if loc.shape != scale.shape or loc.ndim != 1 or not (scale > 0).all():
-        raise DataError(path, "scale", "valid: as many positive numbers as in loc")
+    finite = torch.cat([loc.reshape(-1), scale.reshape(-1)]).isfinite().all()
+    if loc.shape != scale.shape or loc.ndim != 1 or not finite or not (scale > 0).all():
+        raise DataError(path, "scale", "valid: as many positive numbers as in loc, all finite")
     return ObservationStatistics(loc, scale)
 
 

@@ -92,7 +92,7 @@ def as_tensordict(episode: Episode, *, number: int = 0) -> TensorDict:
         and ``step`` ``(T,)`` int64.
 
     Raises:
-        BMRLError: if a part of the observation is named like one of TorchRL's keys.
+        BMRLError: if a part of the observation is named like one of TorchRL's keys, or like a path.
 
     Example:
         >>> part = np.zeros((5, 3))
@@ -112,6 +112,12 @@ def as_tensordict(episode: Episode, *, number: int = 0) -> TensorDict:
         if name in RESERVED:
             raise BMRLError(
                 f"a part of the observation is named {name!r}; valid: none of {sorted(RESERVED)}"
+            )
+        # Memory-mapped tensors have it for the name of their file, and it may come from a stranger.
+        if not name or name.startswith(".") or "/" in name or "\\" in name:
+            raise BMRLError(
+                f"a part of the observation is named {name!r}; valid: a name without slashes that "
+                "does not begin with a dot"
             )
     steps = len(episode)
     action = torch.as_tensor(episode.actions)

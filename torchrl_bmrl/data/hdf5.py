@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -42,12 +43,32 @@ def read_names(path: str | Path, file: h5py.File, key: str) -> list[str]:
         DataError: if there is no such group, or it cannot be read.
     """
     try:
-        group = file.get(key)
+        group = _within(path, file, key)
         if isinstance(group, h5py.Group):
             return sorted(group, key=_natural)
+    except DataError:
+        raise
     except DAMAGE as error:
         raise DataError(path, key, f"unreadable ({error})") from error
     raise DataError(path, key, "missing; valid: a group" if group is None else "not a group")
+
+
+def _within(path: str | Path, file: h5py.File, key: str) -> Any:
+    """A node of a file, whose content is in that file and no larger than it can be.
+
+    Raises:
+        DataError: if it lies in another file, or claims more than compression makes of this one.
+    """
+    node = file.get(key)
+    if node is not None and node.file.id != file.id:
+        raise DataError(path, key, f"lies in {node.file.filename}; valid: in this file")
+    if isinstance(node, h5py.Dataset):
+        if node.external or node.is_virtual:
+            raise DataError(path, key, "its content lies in other files; valid: in this file")
+        # gzip makes a thousandth of zeros, and nothing makes less.
+        if node.nbytes > 2**20 + 1100 * os.path.getsize(path):
+            raise DataError(path, key, f"claims {node.nbytes} bytes, more than the file can hold")
+    return node
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
@@ -64,7 +85,7 @@ def read_array(path: str | Path, file: h5py.File, key: str) -> np.ndarray:
         DataError: if it is missing, a group, cannot be read, or holds anything but numbers.
     """
     try:
-        node = file.get(key)
+        node = _within(path, file, key)
         if isinstance(node, h5py.Dataset):
             if node.dtype.kind not in "biuf":
                 raise DataError(path, key, f"dtype {node.dtype}; valid: numbers")
@@ -84,9 +105,11 @@ def read_strings(path: str | Path, file: h5py.File, key: str) -> list[str]:
         DataError: if it is missing, a group, or cannot be read.
     """
     try:
-        node = file.get(key)
+        node = _within(path, file, key)
         if isinstance(node, h5py.Dataset):
             return [_text(value) for value in np.asarray(node[()]).reshape(-1)]
+    except DataError:
+        raise
     except DAMAGE as error:
         raise DataError(path, key, f"unreadable ({error})") from error
     raise DataError(path, key, "missing" if node is None else "a group; valid: a dataset")

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from torchrl_bmrl.errors import DataError
-from torchrl_bmrl.files import write_atomic
+from torchrl_bmrl.files import read_json, write_atomic
 from torchrl_bmrl.reports.page import Picture, Section
 from torchrl_bmrl.reports.tables import Table
 
@@ -64,8 +64,8 @@ def read_studies(run_dir: str | os.PathLike[str]) -> list[Section]:
 
 
 def _read(path: Path) -> Section:
+    content = read_json(path, "the results of a study; remove it")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
         pictures = [
             Picture(
                 # The name alone: a file of a stranger's cannot lead out of the folder.

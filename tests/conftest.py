@@ -1,0 +1,49 @@
+"""Fixtures of the tests that run recipes; those without these packages never ask for them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def recipes() -> Iterator[Any]:
+    """The recipes' modules, importable as they are for a script beside them."""
+    with pytest.MonkeyPatch.context() as patch:
+        from small_runs import RECIPES
+
+        patch.syspath_prepend(str(RECIPES))
+        import settings
+
+        yield settings
+
+
+@pytest.fixture(scope="module")
+def run(recipes: Any) -> Iterator[Any]:
+    """Runs a recipe's function in this process, with episodes of ten steps."""
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    from small_runs import HORIZON, SMALL, configured
+
+    from torchrl_bmrl import names
+    from torchrl_bmrl.evaluation import rollout
+
+    def run(folder: Path, function: Any, *overrides: str) -> Path:
+        settings = configured(*SMALL, f"run_dir={folder}", "workers=1", *overrides)
+        recipes.run_recipe(settings, function)
+        return folder
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(names, "HORIZON", HORIZON)
+        patch.setitem(rollout.evaluate_policy.__kwdefaults__, "max_steps", HORIZON)
+        yield run
+
+
+@pytest.fixture(scope="module")
+def finished(run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of all stages that was never stopped."""
+    import two_stage
+
+    return run(tmp_path_factory.mktemp("finished"), two_stage.two_stage)

@@ -1,0 +1,67 @@
+"""The smallest run that has every part; its fixtures are in conftest.py."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+HORIZON = 10
+SMALL = [
+    "preset=smoke",
+    "tasks=[reach,lift]",
+    "collect.train_episodes.reach=1",
+    "collect.train_episodes.lift=1",
+    "bcq.epochs=2",
+    "bcq.updates_per_epoch=6",
+    "bcq.batch_size=8",
+    "bcq.num_cells=[16,16]",
+    "distill.updates=12",
+    "distill.batch_size=8",
+    "distill.num_cells=[16,16]",
+    "evaluate.num_candidates=5",
+    "evaluate.latent_sources=[prototype,online,demonstration]",
+    "log_interval=4",
+    "checkpoint_interval=4",
+]
+Run = Callable[..., Path]
+"""Runs a recipe's function in a folder, in this process; fixture ``run``."""
+
+
+def configured(*overrides: str) -> DictConfig:
+    with initialize_config_dir(version_base="1.3", config_dir=str(RECIPES / "config")):
+        return compose("recipe", overrides=list(overrides))
+
+
+def contents(folder: Path, *patterns: str) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for pattern in patterns
+        for path in sorted(folder.glob(pattern))
+        if path.is_file()
+    }
+
+
+def times(folder: Path) -> dict[str, int]:
+    """When what is costly was written."""
+    patterns = ("data/*.hdf5", "**/*.safetensors", "evaluation/*.csv", "bcq/*/evaluations.csv")
+    return {
+        str(path.relative_to(folder)): path.stat().st_mtime_ns
+        for pattern in patterns
+        for path in folder.glob(pattern)
+    }
+
+
+class Interruption:
+    """A progress callback that stops the job at one of its updates."""
+
+    def __init__(self, update: int, error: type[BaseException]) -> None:
+        self.done, self.update, self.error = 0, update, error
+
+    def __call__(self, count: int) -> None:
+        self.done += count
+        if self.done == self.update:
+            raise self.error("stopped by the test")

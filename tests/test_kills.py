@@ -1,0 +1,108 @@
+"""Whole runs killed at random moments, and started again.
+
+Two of them, with two tasks; with ``BMRL_KILLS=50`` in the environment fifty of preset smoke, which
+take an hour.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("hydra")
+pytest.importorskip("gymnasium")
+pytest.importorskip("h5py")
+pytest.importorskip("matplotlib")
+pytest.importorskip("safetensors")
+pytest.importorskip("scipy")
+pytest.importorskip("tqdm")
+
+from small_runs import RECIPES, contents
+
+from torchrl_bmrl.checkpoint import load_checkpoint
+from torchrl_bmrl.data.robomimic import open_episodes, read_kept_episode
+from torchrl_bmrl.evaluation import read_results
+
+pytestmark = [pytest.mark.robosuite, pytest.mark.slow, pytest.mark.timeout(0)]
+KILLS = int(os.environ.get("BMRL_KILLS", "0"))
+TASKS = [] if KILLS else ["tasks=[reach,lift]"]
+EQUAL = (
+    "results.csv",
+    "tables/*",
+    "data/*.hdf5",
+    "data/statistics.json",
+    "**/*.safetensors",
+    "bcq/*/evaluations.csv",
+    "evaluation/*.csv",
+    "logs/*/scalars/*",
+)
+"""What a run that was killed has in common with one that was not: all but times."""
+
+
+def start(folder: Path) -> subprocess.Popen[bytes]:
+    command = [sys.executable, str(RECIPES / "two_stage.py"), "preset=smoke", f"run_dir={folder}"]
+    command += ["workers=2", *TASKS]
+    with (folder.parent / f"{folder.name}.log").open("ab") as log:
+        return subprocess.Popen(command, stdout=log, stderr=log, cwd=folder.parent)
+
+
+def finish(folder: Path) -> float:
+    """Runs to the end; how long it took [s]."""
+    began = time.monotonic()
+    code = start(folder).wait()
+    assert code == 0, (folder.parent / f"{folder.name}.log").read_text()[-3000:]
+    return time.monotonic() - began
+
+
+def read_everything(folder: Path) -> dict[str, bytes]:
+    """Reads every finished file; the episodes and checkpoints among them."""
+    for path in folder.glob("data/.episodes/*/*.npz"):
+        read_kept_episode(path)
+    for path in folder.glob("data/*.hdf5"):
+        with open_episodes(path) as episodes:
+            assert len(episodes) == 3
+    for path in folder.glob("**/*.safetensors"):
+        kind = "student" if path.parent.name == "distill" else "bcq"
+        load_checkpoint(path, kind=kind)
+    for path in folder.glob("evaluation/*.csv"):
+        read_results(path)
+    return contents(folder, "data/.episodes/*/*.npz", "data/*.hdf5", "evaluation/*.csv")
+
+
+def test_killed_at_any_moment_a_run_has_lost_nothing_and_ends_with_the_same_files(
+    tmp_path: Path,
+) -> None:
+    whole = tmp_path / "whole"
+    seconds = finish(whole)
+    expected = contents(whole, *EQUAL)
+    assert len(expected) > 40
+    moments, killed = random.Random(0), 0
+    while killed < (KILLS or 2):
+        folder = tmp_path / f"killed-{killed}"
+        process, moment, began = start(folder), moments.uniform(0.0, seconds), time.monotonic()
+        try:
+            process.wait(moment)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+        else:  # faster than the first one
+            seconds = time.monotonic() - began
+            shutil.rmtree(folder)
+            continue
+        killed += 1
+        time.sleep(1.0)  # its workers end with it
+        kept = read_everything(folder)
+        print(f"{killed}: {moment:.1f} of {seconds:.1f} s, {len(kept)} files kept", flush=True)
+        finish(folder)
+        assert contents(folder, *EQUAL) == expected, f"killed after {moment:.1f} s"
+        now = contents(folder, "data/*.hdf5", "evaluation/*.csv")
+        assert all(now[name] == kept[name] for name in kept if name in now)
+        shutil.rmtree(folder)

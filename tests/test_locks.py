@@ -1,0 +1,75 @@
+"""One run at a time in a folder."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("filelock")
+
+from torchrl_bmrl.errors import FolderInUseError
+from torchrl_bmrl.locks import hold
+
+HOLDING = """
+import sys
+from pathlib import Path
+from torchrl_bmrl.locks import hold
+with hold(Path(sys.argv[1]), sys.argv[2:]):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@contextmanager
+def held(folder: Path, *names: str) -> Iterator[subprocess.Popen[str]]:
+    """Another process that holds parts of a folder, and ends at the end."""
+    command = [sys.executable, "-c", HOLDING, str(folder), *names]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, **pipes) as process:  # type: ignore[call-overload]
+        assert process.stdout.readline() == "held\n"
+        yield process
+        process.stdin.close()
+
+
+def test_a_folder_in_use_is_refused_with_the_owners_process_and_host(tmp_path: Path) -> None:
+    with held(tmp_path, "run") as owner:
+        with pytest.raises(FolderInUseError) as caught, hold(tmp_path):
+            pass
+        assert (caught.value.process, caught.value.host) == (str(owner.pid), socket.gethostname())
+        assert f"{tmp_path}: in use by process {owner.pid} on" in str(caught.value)
+    with hold(tmp_path):
+        pass
+
+
+def test_what_a_killed_process_held_is_taken_over(tmp_path: Path) -> None:
+    with held(tmp_path, "run", "lift") as owner:
+        owner.send_signal(signal.SIGKILL)
+        owner.wait()
+    with hold(tmp_path, ["lift", "run"]):
+        said = (tmp_path / ".locks" / "run.json").read_text()
+    assert f'"process": {os.getpid()}' in said
+
+
+def test_parts_are_held_each_for_itself_and_none_when_one_is_refused(tmp_path: Path) -> None:
+    with held(tmp_path, "lift"):
+        with hold(tmp_path, ["reach"]):
+            pass
+        with pytest.raises(FolderInUseError), hold(tmp_path, ["a", "lift", "reach"]):
+            pass
+        with hold(tmp_path, ["reach", "a"]):  # they were given back
+            pass
+
+
+def test_a_damaged_note_of_the_owner_still_refuses(tmp_path: Path) -> None:
+    with held(tmp_path, "run"):
+        (tmp_path / ".locks" / "run.json").write_text("{")
+        with pytest.raises(FolderInUseError, match="process unknown"), hold(tmp_path):
+            pass
