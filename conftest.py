@@ -16,9 +16,13 @@ import torch  # noqa: E402
 
 torch.set_num_threads(1)
 
-# Modules whose import, and so their docstrings' examples, needs an extra.
+# Modules whose import, or whose docstrings' examples, need an extra.
 _NEEDS = {
-    "gymnasium": ["torchrl_bmrl/envs/*", "torchrl_bmrl/reports/films.py"],
+    "gymnasium": [
+        "torchrl_bmrl/data/demonstrations.py",
+        "torchrl_bmrl/envs/*",
+        "torchrl_bmrl/reports/films.py",
+    ],
     "h5py": [
         *(
             f"torchrl_bmrl/data/{name}.py"
@@ -41,10 +45,15 @@ _NEEDS = {
     "hydra": ["tests/small_runs.py"],
     "matplotlib": ["tests/published_data.py", "torchrl_bmrl/reports/*"],
     "mujoco": ["torchrl_bmrl/reports/films.py"],
-    "robosuite": ["torchrl_bmrl/envs/*", "torchrl_bmrl/experts/*"],
-    "safetensors": ["torchrl_bmrl/checkpoint.py"],
+    "robosuite": [
+        "torchrl_bmrl/envs/*",
+        "torchrl_bmrl/evaluation/rollout.py",
+        "torchrl_bmrl/experts/*",
+    ],
+    "safetensors": ["torchrl_bmrl/agents.py", "torchrl_bmrl/checkpoint.py"],
     "scipy": ["torchrl_bmrl/evaluation/*", "torchrl_bmrl/reports/*"],
     "tqdm": ["torchrl_bmrl/data/__main__.py", "torchrl_bmrl/parallel.py"],
+    "yaml": ["torchrl_bmrl/runs.py"],
 }
 collect_ignore_glob = sorted(
     {glob for package, globs in _NEEDS.items() if find_spec(package) is None for glob in globs}

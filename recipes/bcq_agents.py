@@ -159,6 +159,7 @@ class Agents:
         else:
             metadata = {"kind": self.kind, "names": self.names, "updates": update}
             metadata |= {"evaluations": self.evaluations, "diverged": self.diverged}
+            metadata["settings"] = deciding_settings(self.config)
         options = {"device": self.config.device, "keep": self.config.keep_checkpoints}
         keep_training(self.path, self.loss, self.optimizers, metadata, **options)
         if self.kind != "bcq":

@@ -1,6 +1,6 @@
 """Demonstrations of the scripted experts: one robomimic-layout HDF5 file per task.
 
-    python recipes/collect.py                    # 60 + 6 episodes of each task
+    python recipes/collect.py                    # 60 + 6 episodes of each task, 80 + 6 of lift
     python recipes/collect.py preset=paper       # the paper's sizes
 
 Killed at any moment it keeps every finished episode; the same command goes on.

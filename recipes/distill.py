@@ -17,7 +17,7 @@ from pathlib import Path
 import hydra
 import torch
 from omegaconf import DictConfig
-from settings import Config, deciding_settings, run_recipe
+from settings import Config, deciding_settings, run_recipe, tell
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -118,6 +118,7 @@ def train_student(config: Config, report: Report) -> None:
     )
     done = kept["updates"] if kept else 0
     if done:
+        tell(config, f"distillation: goes on from update {done}")
         report(done)
     if done == settings.updates:
         return
@@ -155,6 +156,7 @@ def train_student(config: Config, report: Report) -> None:
         }
         keeping = {"device": config.device, "keep": config.keep_checkpoints}
         keep_training(path, own, {"student": optimizer}, metadata, **keeping)
+        tell(config, f"distillation: update {update} kept, accuracy {metadata['accuracy']:.1%}")
 
     update = saved = done
     try:

@@ -14,13 +14,14 @@ os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import hydra
 import numpy as np
 import torch
 from omegaconf import DictConfig
-from settings import Config, run_recipe
+from settings import Config, run_recipe, tell
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.transforms import Transform
@@ -71,6 +72,7 @@ def keep_rows(
     path = Path(config.run_dir) / "evaluation" / f"{name}.csv"
     if path.exists():
         report(config.evaluate.episodes * HORIZON)
+        tell(config, f"{path}: read back")
         return read_results(path)
     seeds = [derive_seed(config.seed, "evaluate", task, i) for i in range(config.evaluate.episodes)]
     rows = [
@@ -86,6 +88,8 @@ def keep_rows(
         for i, outcome in enumerate(outcomes(seeds))
     ]
     write_results(path, rows)
+    mean = fmean(row.episode_return for row in rows)
+    tell(config, f"{path}: mean return {mean:.1f}, {sum(row.success for row in rows)} successes")
     return rows
 
 

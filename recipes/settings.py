@@ -12,6 +12,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from tqdm import tqdm
 
 from torchrl_bmrl.agents import LATENT_SOURCES, TASK_ENCODERS
 from torchrl_bmrl.command_line import exit_codes
@@ -179,6 +180,7 @@ class Config:
     compile: bool = False  # the updates, with torch.compile: half a minute, then faster
     cudagraphs: bool = False  # captures the updates, on a GPU
     logger: str = "csv"  # csv, wandb, tensorboard, none
+    verbose: bool = False  # also says what is kept, read back, gone on from
     log_interval: int = 100  # updates
     checkpoint_interval: int = 1000  # updates
     keep_checkpoints: int = 2  # the newest, and those before it in case that is damaged
@@ -372,6 +374,12 @@ OUT_OF_MEMORY = (
 )
 
 
+def tell(config: Config, message: str) -> None:
+    """Says what only those want to know who asked for it, with ``verbose``."""
+    if config.verbose:
+        tqdm.write(message, file=sys.stderr)
+
+
 def run_recipe(
     settings: DictConfig, run: Callable[[Config], None], *, splits: bool = False
 ) -> None:
@@ -394,6 +402,11 @@ def run_recipe(
         # A job of only some tasks leaves the others', and all else, to other jobs.
         with hold(run_dir, config.only or ["run", *config.tasks]):
             open_run(run_dir, OmegaConf.to_container(settings, resolve=True))
+            tell(
+                config,
+                f"{run_dir}: {run.__name__}, preset {config.preset}, seed {config.seed}, "
+                f"{config.workers} workers, {config.device}",
+            )
             run(config)
 
 

@@ -15,11 +15,12 @@ os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
+from statistics import fmean
 
 import hydra
 from bcq_agents import Agents
 from omegaconf import DictConfig
-from settings import Config, run_recipe
+from settings import Config, run_recipe, tell
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.optim import Adam
@@ -118,6 +119,7 @@ def train_agents(
     kept = Agents(config, agents, statistics)
     kept.load()
     if kept.updates:
+        tell(config, f"bcq {', '.join(agents)}: goes on from update {kept.updates}")
         report(kept.updates * len(agents))
     if kept.updates < config.bcq.epochs * config.bcq.updates_per_epoch:
         train_on(config, kept, buffer, statistics, report)
@@ -158,6 +160,8 @@ def train_on(
                     rows += evaluate_epoch(config, agents[name], loss, statistics, epoch, update)
                     write_rows(kept.folder / name / "evaluations.csv", rows)
                     kept.keep_best(name, update)
+                    mean = fmean(row["return"] for row in rows if row["epoch"] == epoch)
+                    tell(config, f"bcq {name}: mean return {mean:.1f} after epoch {epoch}")
             if saving:
                 kept.save(update)
             report(len(agents))

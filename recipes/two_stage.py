@@ -21,7 +21,7 @@ from collect import collect
 from distill import distill
 from evaluate import evaluate
 from omegaconf import DictConfig
-from settings import Config, run_recipe
+from settings import Config, run_recipe, tell
 from train_bcq import train_all
 
 from torchrl_bmrl.files import read_json, write_atomic
@@ -39,6 +39,7 @@ def two_stage(config: Config) -> None:
         # Summed over interruptions, up to the one that was killed.
         seconds[name] = round(seconds.get(name, 0.0) + time.monotonic() - started, 1)
         write_atomic(path, json.dumps(seconds, indent=2) + "\n")
+        tell(config, f"{name}: done")
     print(", ".join(f"{name} {value / 60:.1f} min" for name, value in seconds.items()))
 
 

@@ -255,6 +255,36 @@ def test_another_file_s_state_does_not_overwrite_the_data(
         assert torch.equal(data["object"], before["object"])
 
 
+class Executed:
+    """What runs when a pickle of it is read."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.path,)
+
+
+def test_a_pickle_among_the_converted_data_is_refused_and_not_executed(
+    path: Path, tmp_path: Path
+) -> None:
+    folder = RobomimicExperienceReplay(path).data_path
+    executed = tmp_path / "executed"
+    data = TensorDict.load_memmap(folder / "data").clone()
+    data.set_non_tensor("x", Executed(executed))
+    data.memmap(tmp_path / "changed")
+    shutil.copytree(tmp_path / "changed", folder / "data", dirs_exist_ok=True)
+    metadata = json.loads((folder / "metadata.json").read_text())
+    metadata["sizes"] = {name: (folder / name).stat().st_size for name in metadata["sizes"]}
+    (folder / "metadata.json").write_text(json.dumps(metadata))
+    with pytest.raises(DataError, match="pickle"):
+        RobomimicExperienceReplay(path)
+    assert not executed.exists()
+    with pytest.warns(FutureWarning, match="pickle"):  # it would have been
+        TensorDict.load_memmap(folder / "data")
+    assert executed.exists()
+
+
 @pytest.mark.parametrize("damage", ["shortened", "removed", "emptied"])
 def test_a_damaged_cache_is_made_anew(path: Path, damage: str) -> None:
     replay = RobomimicExperienceReplay(path)

@@ -1,8 +1,11 @@
-"""What the README and the docs show is executed."""
+"""What the README and the docs show is executed: code as it is, commands by what they call."""
 
 from __future__ import annotations
 
+import importlib
+import os
 import re
+import shlex
 from pathlib import Path
 
 import pytest
@@ -11,12 +14,24 @@ from helpers import NO_UPDATER
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCKS = {page: re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL) for page in PAGES}
+NEEDS = {page: re.findall(r"<!-- needs: (\w+) -->", page.read_text()) for page in PAGES}
 
 
 @pytest.mark.filterwarnings(NO_UPDATER)
-@pytest.mark.parametrize("page", [p for p in PAGES if BLOCKS[p]], ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(
+            page,
+            id=page.stem,
+            marks=[pytest.mark.robosuite] if "robosuite" in NEEDS[page] else [],
+        )
+        for page in PAGES
+        if BLOCKS[page]
+    ],
+)
 def test_examples_of_a_page_run_one_after_the_other(page: Path) -> None:
-    for package in re.findall(r"<!-- needs: (\w+) -->", page.read_text()):
+    for package in NEEDS[page]:
         pytest.importorskip(package)
     namespace = {"__name__": "example"}
     for block in BLOCKS[page]:
@@ -31,3 +46,137 @@ def test_readme_shows_a_loss_in_use() -> None:
 def test_links_to_files_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text()):
         assert (page.parent / target).exists(), target
+
+
+# -- commands --------------------------------------------------------------------------------------
+
+COMMANDS = [
+    (page, line)
+    for page in [*PAGES, ROOT / "CONTRIBUTING.md"]
+    for block in re.findall(r"```bash\n(.*?)```", page.read_text(), re.DOTALL)
+    for whole in block.replace("\\\n", " ").splitlines()
+    for line in whole.split("&&")
+    if line.strip()
+]
+
+
+def parts(command: str) -> list[str]:
+    return shlex.split(command, comments=True)
+
+
+def test_every_command_is_of_a_kind_that_a_test_or_the_checks_of_a_change_run() -> None:
+    known = {
+        "pip",
+        "pytest",
+        "ruff",
+        "mypy",
+        "lint-imports",
+        "pre-commit",
+        ".",
+        "python3",
+        "sphinx-build",
+    }
+    for page, line in COMMANDS:
+        words = parts(line)
+        is_python = words[0] == "python" and (
+            (words[1] == "-m" and words[2] == "torchrl_bmrl.data") or (ROOT / words[1]).is_file()
+        )
+        assert words[0] in known or is_python, f"{page.name}: {line}"
+
+
+def test_every_install_names_extras_that_there_are() -> None:
+    text = (ROOT / "pyproject.toml").read_text()
+    extras = set(
+        re.findall(r"^(\w+) = \[", text.partition("optional-dependencies]")[2], re.MULTILINE)
+    )
+    installs = [parts(line) for _, line in COMMANDS if parts(line)[:2] == ["pip", "install"]]
+    assert len(installs) > 5
+    for install in installs:
+        assert install[2:5] == ["-c", "constraints.txt", "-e"]
+        named = re.fullmatch(r"\.(?:\[(.*)\])?", install[5])
+        assert named is not None
+        assert set(filter(None, (named[1] or "").split(","))) <= extras
+
+
+RECIPES = [(page, parts(line)) for page, line in COMMANDS if "python recipes/" in line]
+
+
+@pytest.mark.parametrize(
+    ("page", "words"),
+    RECIPES,
+    ids=[f"{page.stem}-{' '.join(words[1:])}" for page, words in RECIPES],
+)
+def test_every_command_of_a_recipe_gives_settings_that_it_takes(
+    page: Path, words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the recipes then do, test_recipes.py and its like execute at small sizes."""
+    for package in ("hydra", "gymnasium", "h5py", "safetensors", "scipy", "tqdm"):
+        pytest.importorskip(package)
+    from hydra import compose, initialize_config_dir
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from omegaconf import OmegaConf
+
+    monkeypatch.syspath_prepend(str(ROOT / "recipes"))
+    recipe = Path(words[1]).stem
+    module = importlib.import_module(recipe)
+    # test_recipes.py reads the help, test_multirun.py runs the launchers.
+    options = [word for word in words[2:] if not word.startswith(("--help", "hydra/", "hydra."))]
+    if "--multirun" in options:
+        options.remove("--multirun")
+        sweep = OverridesParser.create().parse_overrides(options)
+        assert any(override.is_sweep_override() for override in sweep)
+        options = [
+            f"{override.key_or_group}={next(override.sweep_string_iterator())}"
+            if override.is_sweep_override()
+            else option
+            for override, option in zip(sweep, options, strict=True)
+        ]
+    name = recipe if recipe in ("extrapolation", "publish") else "recipe"
+    with initialize_config_dir(version_base="1.3", config_dir=str(ROOT / "recipes" / "config")):
+        # Set first: what it is otherwise is Hydra's to say, in a command.
+        folder = [] if name == "publish" else ["run_dir=runs/mine"]
+        config = compose(name, overrides=[*folder, *options])
+    config = OmegaConf.to_object(config)
+    if recipe == "extrapolation":
+        module.check_settings(config)
+    elif name == "recipe":
+        monkeypatch.setattr("settings.check_device", lambda device: None)  # there may be no GPU
+        importlib.import_module("settings").check_settings(config)
+
+
+@pytest.mark.robosuite
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", ROOT / "docs" / "data.md"], ids=lambda p: p.stem
+)
+def test_commands_for_data_do_what_the_page_says(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Beside a recording of robosuite's and a file of a run."""
+    for package in ("h5py", "minari", "pyarrow", "tqdm"):
+        pytest.importorskip(package)
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    from episode_files import TASK_PARTS, make_episode
+    from test_robosuite_demos import record
+
+    from torchrl_bmrl.data.__main__ import main
+    from torchrl_bmrl.data.robomimic import write_episodes
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    ours = tmp_path / "runs/two_stage-quick-seed0/data/lift.hdf5"
+    ours.parent.mkdir(parents=True)
+    episodes = [make_episode(seed, parts=TASK_PARTS) for seed in range(2)]
+    args = {"env_name": "BMRLSawyerLift", "type": 1, "env_kwargs": {"control_freq": 20}}
+    write_episodes(ours, episodes, env_args=args, masks={"train": [0], "valid": [1]})
+    record(tmp_path / "demo.hdf5", "lift", 30)
+    arguments = [
+        parts(line)[3:]
+        for at, line in COMMANDS
+        if at == ROOT / page and "-m torchrl_bmrl.data" in line
+    ]
+    assert len(arguments) >= 2
+    for words in arguments:
+        assert main([os.path.expanduser(word) for word in words]) == 0, words
+        target = os.path.expanduser(words[1 if words[0] == "check" else 2])
+        assert capsys.readouterr().out.startswith(f"{target}: ")
+        assert Path(target).exists()

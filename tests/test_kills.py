@@ -1,6 +1,6 @@
 """Whole runs killed at random moments, and started again.
 
-Two of them, with two tasks; with ``BMRL_KILLS=50`` in the environment fifty of preset smoke, which
+One of them, with two tasks; with ``BMRL_KILLS=50`` in the environment fifty of preset smoke, which
 take an hour.
 """
 
@@ -85,7 +85,7 @@ def test_killed_at_any_moment_a_run_has_lost_nothing_and_ends_with_the_same_file
     expected = contents(whole, *EQUAL)
     assert len(expected) > 40
     moments, killed = random.Random(0), 0
-    while killed < (KILLS or 2):
+    while killed < (KILLS or 1):
         folder = tmp_path / f"killed-{killed}"
         process, moment, began = start(folder), moments.uniform(0.0, seconds), time.monotonic()
         try:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -133,6 +135,59 @@ def test_every_stage_is_checked_before_the_first_one_starts(
     config = OmegaConf.to_object(configured("preset=smoke", f"run_dir={tmp_path}", *overrides))
     with pytest.raises(BMRLError, match=says):
         recipes.check_settings(config)
+
+
+@pytest.mark.parametrize(
+    "name", sorted(path.stem for path in RECIPES.glob("*.py") if "@hydra.main" in path.read_text())
+)
+def test_a_recipes_help_says_what_it_does_and_shows_how(name: str) -> None:
+    text = ast.get_docstring(ast.parse((RECIPES / f"{name}.py").read_text())) or ""
+    lines = text.splitlines()
+    assert lines[0].endswith((".", "?"))
+    assert any(line.strip().startswith(f"python recipes/{name}.py") for line in lines)
+    assert len(lines) <= 16  # the rest of the help has 21, a screen 40
+
+
+def test_help_is_one_screen_with_every_preset_and_ablation_and_leaves_nothing(
+    tmp_path: Path,
+) -> None:
+    done = recipe("two_stage", "--help", cwd=tmp_path)
+    lines = done.stdout.splitlines()
+    assert (done.returncode, done.stderr) == (0, "")
+    assert lines[0] == "The whole pipeline: demonstrations, stage 1, stage 2, evaluation, report."
+    assert len(lines) <= 40
+    assert max(map(len, lines)) <= 100
+    for group in ("preset", "ablation"):
+        names = {path.stem for path in (RECIPES / "config" / group).glob("*.yaml")} - {"none"}
+        assert names <= set(re.findall(r"\w+", done.stdout)), group
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_a_run_says_nothing_more_than_its_tables_unless_it_is_verbose(
+    run: Run, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import two_stage
+
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    capsys.readouterr()
+    run(folder, two_stage.two_stage)
+    quiet = capsys.readouterr()
+    assert quiet.err == ""
+    assert quiet.out.splitlines()[-1].startswith("collect 0.")
+    run(folder, two_stage.two_stage, "verbose=true")
+    told = capsys.readouterr()
+    assert told.out.splitlines()[:-1] == quiet.out.splitlines()[:-1]
+    for line in (
+        f"{folder}: two_stage, preset smoke, seed 0, 1 workers, cpu",
+        "bcq lift: goes on from update 12",
+        "distillation: goes on from update 12",
+        f"{folder / 'evaluation' / 'lift-bcq.csv'}: read back",
+        "stage 2: done",
+    ):
+        assert line in told.err.splitlines()
 
 
 @pytest.mark.parametrize("preset", ["smoke", "quick", "paper", "literal", "compose"])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -328,6 +330,44 @@ def test_samples_prepared_ahead_are_no_part_of_a_state(
 def test_a_dump_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="nowhere: not a dump of these data"):
         single().loads(tmp_path / "nowhere")
+
+
+class Executed:
+    """What runs when a pickle of it is read."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("part", ["storage", "rng_state"])
+@every_buffer
+def test_a_pickle_in_a_dump_is_refused_and_not_executed(
+    make: Make, part: str, tmp_path: Path
+) -> None:
+    saved = make()
+    saved.set_rng(torch.Generator().manual_seed(0))
+    saved.dumps(tmp_path / "buffer")
+    before = saved[:].clone()
+    folder = tmp_path / "buffer" / part
+    data = TensorDict.load_memmap(folder).clone()
+    hidden = TensorDict({}, data.batch_size).set_non_tensor("x", Executed(tmp_path / "executed"))
+    hidden.memmap(tmp_path / "hidden")
+    shutil.copytree(tmp_path / "hidden" / "x", folder / "x")
+    meta = json.loads((folder / "meta.json").read_text())
+    meta["x"] = json.loads((tmp_path / "hidden" / "meta.json").read_text())["x"]
+    (folder / "meta.json").write_text(json.dumps(meta))
+    loaded = make()
+    loaded.set_rng(torch.Generator().manual_seed(0))
+    with pytest.raises(DataError, match="pickle"):
+        loaded.loads(tmp_path / "buffer")
+    assert not (tmp_path / "executed").exists()
+    assert (loaded[:] == before).all()
+    with pytest.warns(FutureWarning, match="pickle"):  # it would have been
+        TensorDict.load_memmap(folder)
+    assert (tmp_path / "executed").exists()
 
 
 def test_rows_are_found_from_the_end_too() -> None:

@@ -54,6 +54,9 @@ def make_bcq_loss(
         action_dim: size of the action.
         **options: of :class:`BCQLoss`.
 
+    Raises:
+        BMRLError: for options that :class:`BCQLoss` refuses.
+
     Example:
         >>> make_bcq_loss(num_cells=(8,), observation_dim=3, action_dim=2).num_qvalue_nets
         2
@@ -71,8 +74,24 @@ def make_bcq_loss(
 def load_bcq_loss(path: Path) -> tuple[BCQLoss, dict[str, Any]]:
     """A trained BCQ and its checkpoint's metadata (``task``, ``statistics``, ...).
 
+    Args:
+        path: the checkpoint, such as ``bcq/lift/checkpoint.safetensors`` of a run folder.
+
+    Returns:
+        the loss, frozen, and the metadata.
+
     Raises:
         CheckpointError: if the file is missing, damaged, of another kind or of other shapes.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl_bmrl.checkpoint import save_checkpoint
+        >>> path, options = Path(tempfile.mkdtemp()) / "a.safetensors", {"num_cells": [8]}
+        >>> state = {"module": make_bcq_loss(**options).state_dict()}
+        >>> save_checkpoint(path, state, {"kind": "bcq", "task": "lift", "loss": options})
+        >>> loss, metadata = load_bcq_loss(path)
+        >>> BCQPolicy.from_loss(loss).out_keys, metadata["task"]
+        (['action'], 'lift')
     """
     state, metadata = load_checkpoint(path, kind="bcq")
     return build(make_bcq_loss, metadata.get("loss"), state, path), metadata
@@ -90,8 +109,18 @@ class Student(nn.Module):
         observation_dim: size of the observation.
         action_dim: size of the action.
 
+    Attributes:
+        prototypes: m that stands for each task, ``(num_tasks, m)``; see :meth:`set_prototypes`.
+
     Raises:
         UnknownNameError: for another encoder.
+
+    Example:
+        >>> student = Student(num_tasks=2, num_cells=(8,))
+        >>> student.policy(num_candidates=10, latent_clip=0.5).in_keys
+        ['observation', 'task_latent']
+        >>> student.task_latent_source("prototype", task=1).task_latent
+        tensor([0., 0.])
     """
 
     prototypes: Tensor
@@ -128,24 +157,51 @@ class Student(nn.Module):
 
     @torch.no_grad()
     def embed(self, data: TensorDictBase) -> Tensor:
-        """Embedding of each transition, ``(*B, task_latent_dim)``."""
+        """Embedding of each transition, ``(*B, task_latent_dim)``.
+
+        Args:
+            data: batch ``[*B]`` with what the encoder reads: a transition, or ``task``.
+        """
         return self.task_encoder(data.select(*self.task_encoder.in_keys)).get("task_latent")
 
     @torch.no_grad()
     def set_prototypes(self, datasets: Sequence[TensorDictBase], kind: str) -> None:
-        """Takes each task's prototype from its training data."""
+        """Takes each task's prototype from its training data.
+
+        Args:
+            datasets: one batch ``[N_i]`` per task, in the order of the tasks.
+            kind: ``"mean"`` or ``"medoid"``, see :func:`torchrl_bmrl.modules.prototype`.
+
+        Raises:
+            BMRLError: for another kind, or a task without data.
+        """
         points = [prototype(self.embed(data), kind) for data in datasets]
         self.prototypes.copy_(torch.stack(points))
 
     @torch.no_grad()
     def accuracy(self, data: TensorDictBase) -> float:
-        """Share of transitions whose task the classifier names."""
+        """Share of transitions whose task the classifier names, in [0, 1].
+
+        Args:
+            data: batch ``[*B]`` with what the encoder reads and the class index ``task (*B,)``.
+        """
         encoded = self.task_encoder(data.select(*self.task_encoder.in_keys))
         logits = self.task_classifier(encoded).get("task_logits")
         return (logits.argmax(-1) == data.get("task")).float().mean().item()
 
     def policy(self, *, num_candidates: int, latent_clip: float | None) -> BCQPolicy:
-        """The distilled policy; it reads ``task_latent``."""
+        """The distilled policy; it reads ``task_latent``.
+
+        Args:
+            num_candidates: proposals per state, at least 1.
+            latent_clip: bound on ``action_latent``, ``None`` for none.
+
+        Returns:
+            a policy of the student's own networks, not of copies.
+
+        Raises:
+            BMRLError: for candidates below one.
+        """
         return BCQPolicy(
             self.generator,
             self.qvalue_network,
@@ -162,10 +218,11 @@ class Student(nn.Module):
         Args:
             source: ``"prototype"``, ``"online"`` or ``"demonstration"``.
             task: class index.
-            demonstration: transitions of one episode, for the last source.
+            demonstration: transitions of one episode, batch ``[T]``, for the last source.
 
         Raises:
             UnknownNameError: for another source.
+            BMRLError: as :class:`~torchrl_bmrl.modules.DemonstrationTaskLatent`.
         """
         if source == "prototype":
             return PrototypeTaskLatent(self.prototypes[task])
@@ -185,6 +242,9 @@ def make_distillation_loss(
         student: made for as many tasks as there are teachers.
         teachers: trained agents, such as :meth:`BCQPolicy.from_loss` gives.
         **options: of :class:`MetaDistillationLoss`; the latent is the teachers'.
+
+    Raises:
+        BMRLError: for options that :class:`MetaDistillationLoss` refuses.
 
     Example:
         >>> teachers = [BCQPolicy.from_loss(make_bcq_loss(num_cells=(8,))) for _ in range(2)]
@@ -221,6 +281,17 @@ def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
     Raises:
         CheckpointError: if the file is missing, damaged, of another kind or of other shapes, or
             says something that is not valid.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl_bmrl.checkpoint import save_checkpoint
+        >>> path, options = Path(tempfile.mkdtemp()) / "a.safetensors", {"num_tasks": 1}
+        >>> metadata = {"kind": "student", "student": options, "tasks": ["lift"], "accuracy": 0.99}
+        >>> metadata |= {"latent_clip": 0.5, "statistics": {"loc": [0.0] * 33, "scale": [1.0] * 33}}
+        >>> save_checkpoint(path, {"module": Student(**options).state_dict()}, metadata)
+        >>> student, metadata = load_student(path)
+        >>> metadata["tasks"]
+        ['lift']
     """
     state, metadata = load_checkpoint(path, kind="student")
     student = build(Student, metadata.get("student"), state, path)

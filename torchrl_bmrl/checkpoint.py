@@ -106,6 +106,14 @@ def load_checkpoint(path: Path, *, kind: str) -> tuple[State, Metadata]:
 
     Raises:
         CheckpointError: if the file is missing, damaged, a pickle, or of another kind.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "a.safetensors"
+        >>> save_checkpoint(path, {"step": 3}, {"kind": "example", "task": "lift"})
+        >>> state, metadata = load_checkpoint(path, kind="example")
+        >>> state, metadata["task"]
+        ({'step': 3}, 'lift')
     """
     state, metadata = _read(Path(path))
     return state, _of_kind(path, metadata, kind)
@@ -201,8 +209,21 @@ def _of_kind(path: Path, metadata: Metadata, kind: str) -> Metadata:
 def load_state(module: nn.Module, state: Mapping[str, Tensor], path: Path) -> None:
     """Loads a module's state and names the first key or shape that does not fit.
 
+    Args:
+        module: takes it over.
+        state: parameters and buffers by name, as ``state_dict()`` gives them.
+        path: of the checkpoint that it is from, for the message.
+
     Raises:
         CheckpointError: if keys or shapes differ; nothing is loaded.
+
+    Example:
+        >>> module, path = nn.Linear(2, 1), Path("a.safetensors")
+        >>> load_state(module, nn.Linear(2, 1).state_dict(), path)
+        >>> load_state(module, nn.Linear(3, 1).state_dict(), path)
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.CheckpointError: a.safetensors: 'weight' has shape (1, 3); valid ...
     """
     own = module.state_dict()
     if not isinstance(state, Mapping):

@@ -13,6 +13,7 @@ from torchrl_bmrl.errors import BMRLError, StoppedError
 from torchrl_bmrl.stops import stop_on_signals
 
 _KEPT = "what was done is kept, the same command goes on"
+_LESS = "fewer workers need less"
 
 
 @contextmanager
@@ -56,12 +57,12 @@ def exit_codes(*, out_of_memory: str = "") -> Iterator[None]:
         _say(f"error: {'; '.join(filter(None, [reason, out_of_memory, _KEPT]))}")
         raise SystemExit(1) from error
     except MemoryError as error:
-        _say(f"error: out of memory; fewer workers need less; {_KEPT}")
+        _say(f"error: out of memory; {_LESS}; {_KEPT}")
         raise SystemExit(1) from error
     except RuntimeError as error:
         if "can't allocate memory" not in str(error):  # which PyTorch says of the CPU's
             raise
-        _say(f"error: out of memory; {_KEPT}")
+        _say(f"error: out of memory; {_LESS}; {_KEPT}")
         raise SystemExit(1) from error
     except OSError as error:
         reason = error.strerror or str(error) or type(error).__name__

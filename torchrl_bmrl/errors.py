@@ -63,8 +63,8 @@ class DataError(BMRLError):
         message: what is wrong with it.
 
     Example:
-        >>> print(DataError("lift.hdf5", "data/demo_0/actions", "expected 7 columns, got 6"))
-        lift.hdf5: data/demo_0/actions: expected 7 columns, got 6
+        >>> print(DataError("lift.hdf5", "data/demo_0/rewards", "not a number in row 3"))
+        lift.hdf5: data/demo_0/rewards: not a number in row 3
     """
 
     def __init__(self, path: str | Path, key: str | None, message: str) -> None:
@@ -86,8 +86,8 @@ class CheckpointError(BMRLError):
         message: what is wrong with it.
 
     Example:
-        >>> print(CheckpointError("runs/lift/last", "no manifest"))
-        runs/lift/last: no manifest
+        >>> print(CheckpointError("runs/lift.safetensors", "no such file"))
+        runs/lift.safetensors: no such file
     """
 
     def __init__(self, path: str | Path, message: str) -> None:

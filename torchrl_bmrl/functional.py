@@ -22,6 +22,9 @@ def gaussian_kl(loc: Tensor, scale: Tensor) -> Tensor:
 
     .. math:: \mathrm{KL} = \tfrac12 (\mu^2 + \sigma^2 - 1) - \log\sigma
 
+    Reference: Kingma and Welling, *Auto-Encoding Variational Bayes*, ICLR 2014,
+    https://arxiv.org/abs/1312.6114, appendix B.
+
     Args:
         loc: mean, ``(*B, latent_dim)``.
         scale: standard deviation, ``(*B, latent_dim)``, positive.
@@ -43,16 +46,21 @@ def sample_action_latent(
     device: torch.device | str | None = None,
     dtype: torch.dtype | None = None,
 ) -> Tensor:
-    r"""Draws the VAE's latent for action proposals, z ~ N(0, I) clipped to ±``latent_clip``.
+    r"""Draws the VAE's latent for action proposals, z ~ N(0, I) clipped to ± ``latent_clip``.
 
     The draw is explicit because inside a TorchRL loss a probabilistic module returns its mean, and
     all proposals would be the same.
 
+    Reference: BCQ.
+
     Args:
         shape: shape of the sample, ``(*B, latent_dim)``.
-        latent_clip: bound c; ``None`` for no bound.
+        latent_clip: the bound, above 0; ``None`` for none.
         device: of the sample.
         dtype: of the sample.
+
+    Returns:
+        z, of the shape that was asked for.
 
     Example:
         >>> z = sample_action_latent((1000, 14), latent_clip=0.5)
@@ -77,12 +85,17 @@ def perturbed_action(
 
     .. math:: a' = \mathrm{clip}(a + \phi\, \xi(s, a),\ a_{low},\ a_{high})
 
+    Reference: BCQ, algorithm 1.
+
     Args:
         action: a, ``(*B, action_dim)``.
         perturbation: ξ in [-1, 1], ``(*B, action_dim)``.
-        max_perturbation: φ.
-        low: lower bound, broadcast against ``action``.
-        high: upper bound.
+        max_perturbation: φ, at least 0.
+        low: lower bound, ``()`` or ``(action_dim,)``.
+        high: upper bound, likewise.
+
+    Returns:
+        ``(*B, action_dim)``.
 
     Example:
         >>> low, high = torch.tensor(-1.0), torch.tensor(1.0)
@@ -96,6 +109,8 @@ def soft_clipped_value(state_action_value: Tensor, lmbda: float | Tensor) -> Ten
     r"""Soft clipped double-Q: between the ensemble's minimum and maximum.
 
     .. math:: \lambda \min_j Q_j + (1 - \lambda) \max_j Q_j
+
+    Reference: BCQ, eq. 13.
 
     Args:
         state_action_value: Q of each critic, ``(num_qvalue_nets, *B)``.
@@ -157,6 +172,8 @@ def likely_actions(logits: Tensor, threshold: float | Tensor) -> Tensor:
 
 def squared_error(prediction: Tensor, target: Tensor) -> Tensor:
     r"""Squared Euclidean distance, :math:`\lVert \hat g - g \rVert_2^2`.
+
+    Reference: meta-distillation.
 
     Args:
         prediction: ``(*B, n)``.
@@ -232,6 +249,8 @@ def direction_error(prediction: Tensor, target: Tensor) -> Tensor:
     r"""One minus the cosine of the angle between prediction and target.
 
     .. math:: 1 - \frac{\hat g \cdot g}{\lVert\hat g\rVert \lVert g\rVert}
+
+    Reference: meta-distillation.
 
     Args:
         prediction: ``(*B, n)``.

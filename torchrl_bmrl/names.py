@@ -28,6 +28,9 @@ STEPPERS = ("fast", "robosuite")
 def check_task(task: str) -> str:
     """Returns ``task`` if it is one of :data:`TASKS`.
 
+    Args:
+        task: a name.
+
     Raises:
         UnknownNameError: otherwise; the message lists the valid names.
 
@@ -43,6 +46,9 @@ def check_task(task: str) -> str:
 def composition_stages(composition: str) -> tuple[str, ...]:
     """The tasks of a composition, in their order; they are joined by ``-``.
 
+    Args:
+        composition: such as ``"reach-lift"``; a task alone is a composition of one.
+
     Raises:
         UnknownNameError: if one of them is not a task.
 
@@ -56,6 +62,15 @@ def composition_stages(composition: str) -> tuple[str, ...]:
 def horizon_of(task: str) -> int:
     """Steps of an episode of a task, or of a composition.
 
+    Args:
+        task: one of :data:`TASKS`, or several joined by ``-``.
+
+    Returns:
+        :data:`HORIZON` for a task, :data:`STAGE_HORIZON` for each task of a composition.
+
+    Raises:
+        UnknownNameError: if one of them is not a task.
+
     Example:
         >>> horizon_of("lift"), horizon_of("reach-lift-reach")
         (200, 300)
@@ -66,6 +81,12 @@ def horizon_of(task: str) -> int:
 
 def gymnasium_id(task: str) -> str:
     """Registered gymnasium id of a task; all compositions share one, which takes ``task``.
+
+    Args:
+        task: one of :data:`TASKS`, or several joined by ``-``.
+
+    Raises:
+        UnknownNameError: if one of them is not a task.
 
     Example:
         >>> gymnasium_id("push_left"), gymnasium_id("reach-lift")

@@ -266,6 +266,13 @@ def _death(worker: _Worker) -> str:
 def derive_seed(seed: int, *names: str | int) -> int:
     """A 32-bit seed for one purpose: other names, other stream.
 
+    Args:
+        seed: of the whole, such as a run.
+        *names: of the purpose, such as ``"collect", "lift", 3``.
+
+    Returns:
+        a number in [0, 2³²), the same on every machine.
+
     Example:
         >>> derive_seed(0, "collect", "lift", 3) == derive_seed(0, "evaluate", "lift", 3)
         False

@@ -29,6 +29,8 @@ FREE_TO_CHANGE = (
     "only",
     "stepper",
     "logger",
+    "verbose",
+    "checkpoint_interval",
     "keep_checkpoints",
     "imitate",
     "interpolation",
@@ -127,8 +129,21 @@ def _adopt(run_dir: Path, base: Path, patterns: Iterable[str]) -> None:
 def read_settings(run_dir: Path) -> dict[str, Any]:
     """The configuration of a run folder.
 
+    Args:
+        run_dir: the folder.
+
+    Returns:
+        the settings as :func:`open_run` was given them, nested as they were.
+
     Raises:
         DataError: if there is none, or it is not YAML.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> open_run(folder, {"seed": 0, "bcq": {"lr": 0.001}})
+        >>> read_settings(folder)
+        {'seed': 0, 'bcq': {'lr': 0.001}}
     """
     path = run_dir / "config.yaml"
     if not path.is_file():
@@ -154,8 +169,21 @@ class _Loader(yaml.SafeLoader):
 def read_versions(run_dir: Path) -> dict[str, str]:
     """Versions of what the run uses.
 
+    Args:
+        run_dir: the folder.
+
+    Returns:
+        versions by package, and of ``python``; ``"None"`` for a package that was not installed.
+
     Raises:
         DataError: if the folder has no ``versions.json``, or it is damaged.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> open_run(folder, {"seed": 0})
+        >>> read_versions(folder)["torchrl_bmrl"] == __version__
+        True
     """
     path = run_dir / "versions.json"
     versions = read_json(path, "the versions of a run")
@@ -212,6 +240,13 @@ def make_logger(kind: str, run_dir: Path, name: str, step: int = 0) -> Any:
 
     Raises:
         UnknownNameError: for another kind.
+
+    Example:
+        >>> import tempfile
+        >>> logger = make_logger("csv", Path(tempfile.mkdtemp()), "bcq_lift")
+        >>> log_metrics(logger, {"loss_qvalue": 0.5}, step=100)
+        >>> make_logger("none", Path("runs/a"), "bcq_lift") is None
+        True
     """
     if kind not in LOGGERS:
         raise UnknownNameError("logger", kind, LOGGERS)
@@ -251,6 +286,19 @@ def log_metrics(logger: Any, metrics: Mapping[str, Any], step: int) -> None:
     """Logs scalars under their names; does nothing without a logger.
 
     A logger that fails is reported on stderr, once, and not used again.
+
+    Args:
+        logger: of :func:`make_logger`; ``None`` for none.
+        metrics: numbers, or tensors of one number, by name.
+        step: that they belong to.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> logger = make_logger("csv", folder, "bcq_lift")
+        >>> log_metrics(logger, {"loss_qvalue": 0.5}, step=100)
+        >>> [file.name for file in folder.rglob("*.csv")]
+        ['loss_qvalue.csv']
     """
     if logger is None or logger in _lost:
         return

@@ -27,6 +27,10 @@ def make_adam(params: Iterable[Tensor], lr: float) -> Adam:
     A scheduler changes the learning rate in place, which neither a compiled nor a captured update
     takes for another program.
 
+    Args:
+        params: what is trained, on one device.
+        lr: learning rate.
+
     Example:
         >>> optimizer = make_adam(torch.nn.Linear(2, 1).parameters(), lr=1e-3)
         >>> optimizer.param_groups[0]["lr"]
@@ -73,7 +77,21 @@ def load_adam(optimizer: Adam, state: dict[str, Any]) -> None:
 
 
 def get_rng_state(device: str = "cpu") -> dict[str, Tensor]:
-    """State of PyTorch's random numbers, on the CPU and on a GPU that is the device."""
+    """State of PyTorch's random numbers, on the CPU and on a GPU that is the device.
+
+    Args:
+        device: that trains, such as ``"cpu"`` or ``"cuda:0"``.
+
+    Returns:
+        the states, under ``"cpu"`` and, for a GPU, ``"cuda"``.
+
+    Example:
+        >>> state = get_rng_state()
+        >>> first = torch.rand(2)
+        >>> set_rng_state(state)
+        >>> torch.equal(torch.rand(2), first)
+        True
+    """
     state = {"cpu": torch.get_rng_state()}
     if torch.device(device).type == "cuda":
         state["cuda"] = torch.cuda.get_rng_state(device)
@@ -81,7 +99,18 @@ def get_rng_state(device: str = "cpu") -> dict[str, Tensor]:
 
 
 def set_rng_state(state: dict[str, Tensor], device: str = "cpu") -> None:
-    """Takes over what :func:`get_rng_state` gave."""
+    """Takes over what :func:`get_rng_state` gave.
+
+    Args:
+        state: of that function.
+        device: that trains; where the state has one of a GPU, this GPU takes it over.
+
+    Example:
+        >>> before = get_rng_state()
+        >>> set_rng_state(before)
+        >>> torch.equal(get_rng_state()["cpu"], before["cpu"])
+        True
+    """
     torch.set_rng_state(state["cpu"])
     if "cuda" in state:
         torch.cuda.set_rng_state(state["cuda"], device)
@@ -94,7 +123,7 @@ def gradient_step(optimizer: Adam, loss: Tensor, max_norm: float | None = None) 
 
     Args:
         optimizer: of :func:`make_adam`; other options of Adam than its defaults are not read.
-        loss: ``()``, or of a :class:`~torchrl_bmrl.objectives.StackedLoss` ``[N]``.
+        loss: shape ``()``, or of a :class:`~torchrl_bmrl.objectives.StackedLoss` ``[N]``.
         max_norm: bound on the norm of the gradient, of each member for itself.
 
     Example:

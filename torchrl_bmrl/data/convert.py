@@ -139,7 +139,8 @@ def convert(
 
     Args:
         source: an HDF5 file in robomimic's layout or of robosuite, or a Minari data set's folder.
-        target: what to write: a file for robomimic, a folder for Minari and LeRobot.
+        target: what to write: a file for robomimic, a folder for LeRobot and for Minari, whose
+            names it ``<namespace>/<name>-v<number>``.
         to: ``"robomimic"``, ``"minari"`` or ``"lerobot"``.
         task: whose scene a robosuite ``demo.hdf5`` was recorded in.
         tracking: see :func:`torchrl_bmrl.data.robosuite.open_episodes`.
@@ -153,6 +154,20 @@ def convert(
             where the source does not tell it.
         DataError: naming file, key and row for what cannot be trained on, for a target that exists
             or cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.zeros(5)
+        >>> episode = Episode(
+        ...     observations=x, next_observations=x, actions=a, rewards=r, terminated=r > 0
+        ... )
+        >>> robomimic.write_episodes(folder / "lift.hdf5", [episode], env_args={})
+        >>> target = folder / "sawyer" / "lift-v0"
+        >>> convert(folder / "lift.hdf5", target, to="minari", fps=20)
+        >>> sorted(file.name for file in target.rglob("*.*"))
+        ['main_data.hdf5', 'metadata.json']
     """
     if to not in TARGETS:
         raise UnknownNameError("format", to, TARGETS)

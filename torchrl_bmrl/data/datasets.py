@@ -22,6 +22,7 @@ from torchrl.envs.transforms import Transform
 
 from torchrl_bmrl.data.episodes import Episode, as_tensordict
 from torchrl_bmrl.data.robomimic import count_steps, open_episodes, read_metadata
+from torchrl_bmrl.data.sampler import read_memmap
 from torchrl_bmrl.data.schema import check_episode, layout_of
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
 from torchrl_bmrl.files import new_folder
@@ -90,9 +91,19 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
         ConfigError: for invalid options.
 
     Example:
-        >>> import torchrl_bmrl.data  # registers the prefix
+        >>> import tempfile
+        >>> import numpy as np
         >>> from torchrl.data.datasets import load_dataset
-        >>> replay = load_dataset("robomimic:lift.hdf5", split="train")  # doctest: +SKIP
+        >>> from torchrl_bmrl.data.robomimic import write_episodes
+        >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.zeros(5)
+        >>> episode = Episode(
+        ...     observations=x, next_observations=x, actions=a, rewards=r, terminated=r > 0
+        ... )
+        >>> path = Path(tempfile.mkdtemp()) / "lift.hdf5"
+        >>> write_episodes(path, [episode], env_args={}, masks={"train": [0]})
+        >>> replay = load_dataset(f"robomimic:{path}", split="train", batch_size=32)
+        >>> replay.sample()["next", "x"].shape
+        torch.Size([32, 3])
     """
 
     def __init__(
@@ -132,7 +143,7 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
                 # Damaged. (Asked twice: another process may just have finished.)
                 shutil.rmtree(self._path, ignore_errors=True)
             _convert(source, self._path, options, split_trajs)
-        data = TensorDict.load_memmap(self._path / "data")
+        data = read_memmap(self._path / "data")
         super().__init__(
             storage=FixedStorage(data),
             sampler=sampler,
@@ -258,7 +269,7 @@ def _statistics(data: TensorDict) -> dict[str, dict[str, list[float]]]:
 
 def _split(path: Path) -> None:
     """Replaces flat data by one padded row per episode."""
-    data = TensorDict.load_memmap(path)
+    data = read_memmap(path)
     split = split_trajectories(data.to_tensordict(), trajectory_key="episode")
     shutil.rmtree(path)
     _allocate(split, path).update_(split)

@@ -41,6 +41,25 @@ def read_demonstrations(path: Path, *, split: str | None = None, num_task: int) 
         DataError: naming file and key, for what that class refuses, and for parts of the
             observation or actions that are not the six tasks', missing ``successes``, or an episode
             that terminates: these tasks end at their horizon, which truncates.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl_bmrl.data import Episode
+        >>> from torchrl_bmrl.data.robomimic import write_episodes
+        >>> parts = {name: np.zeros((5, size)) for name, size in OBSERVATION_SHAPES.items()}
+        >>> episode = Episode(
+        ...     observations=parts,
+        ...     next_observations=parts,
+        ...     actions=np.zeros((5, 7)),
+        ...     rewards=np.zeros(5),
+        ...     terminated=np.zeros(5, bool),
+        ...     extras={"successes": np.zeros(5, bool)},
+        ... )
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> write_episodes(folder / "lift.hdf5", [episode], env_args={}, masks={"train": [0]})
+        >>> data = read_demonstrations(folder / "lift.hdf5", split="train", num_task=1)
+        >>> data["robot0_eef_pos"].shape, data["task"].tolist()
+        (torch.Size([5, 3]), [1, 1, 1, 1, 1])
     """
     replay = RobomimicExperienceReplay(path, split=split, observation_keys=OBSERVATION_SHAPES)
     data = replay[:].copy()
@@ -97,6 +116,36 @@ def write_statistics(data_dir: Path, tasks: Iterable[str]) -> ObservationStatist
 
     Those over all tasks together (``loc`` and ``scale``) normalise; those of each task are under
     ``tasks``.
+
+    Args:
+        data_dir: folder of the demonstrations, ``<task>.hdf5``, each with a mask ``train``; the
+            statistics are written into it.
+        tasks: names of the tasks, each with the same weight.
+
+    Returns:
+        those over all tasks together.
+
+    Raises:
+        UnknownNameError: for a name that is not a task.
+        DataError: for files that :func:`read_demonstrations` refuses.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl_bmrl.data import Episode
+        >>> from torchrl_bmrl.data.robomimic import write_episodes
+        >>> parts = {name: np.zeros((5, size)) for name, size in OBSERVATION_SHAPES.items()}
+        >>> episode = Episode(
+        ...     observations=parts,
+        ...     next_observations=parts,
+        ...     actions=np.zeros((5, 7)),
+        ...     rewards=np.zeros(5),
+        ...     terminated=np.zeros(5, bool),
+        ...     extras={"successes": np.zeros(5, bool)},
+        ... )
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> write_episodes(folder / "lift.hdf5", [episode], env_args={}, masks={"train": [0]})
+        >>> write_statistics(folder, ["lift"]).loc.shape
+        torch.Size([33])
     """
     raw = {
         task: read_demonstrations(
@@ -128,6 +177,13 @@ def read_statistics(data_dir: Path, task: str | None = None) -> ObservationStati
 
     Raises:
         DataError: if the file is missing or damaged, or knows nothing of the task.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> write_atomic(folder / "statistics.json", '{"loc": [0.5], "scale": [2.0]}')
+        >>> read_statistics(folder)
+        ObservationStatistics(loc=tensor([0.5000]), scale=tensor([2.]))
     """
     path = data_dir / "statistics.json"
     if not path.is_file():
@@ -158,7 +214,32 @@ def load_transitions(
         num_task: class index y.
 
     Returns:
-        batch ``[N]`` with ``observation (33,)`` and the keys of :func:`read_demonstrations`.
+        batch ``[N]`` with ``observation (N, 33)`` in place of its parts, now and under ``"next"``,
+        and the other keys of :func:`read_demonstrations`.
+
+    Raises:
+        UnknownNameError: for a name that is not a task.
+        DataError: for a file that :func:`read_demonstrations` refuses.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl_bmrl.data import Episode
+        >>> from torchrl_bmrl.data.robomimic import write_episodes
+        >>> parts = {name: np.zeros((5, size)) for name, size in OBSERVATION_SHAPES.items()}
+        >>> episode = Episode(
+        ...     observations=parts,
+        ...     next_observations=parts,
+        ...     actions=np.zeros((5, 7)),
+        ...     rewards=np.zeros(5),
+        ...     terminated=np.zeros(5, bool),
+        ...     extras={"successes": np.zeros(5, bool)},
+        ... )
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> write_episodes(folder / "lift.hdf5", [episode], env_args={}, masks={"train": [0]})
+        >>> statistics = ObservationStatistics(torch.zeros(33), torch.ones(33))
+        >>> data = load_transitions(folder, "lift", statistics, split="train", num_task=1)
+        >>> data["next", "observation"].shape
+        torch.Size([5, 33])
     """
     raw = read_demonstrations(demonstration_path(data_dir, task), split=split, num_task=num_task)
     return transform_data(raw, statistics)

@@ -39,6 +39,14 @@ class Episode:
         extras: further arrays of T rows, such as ``successes`` (bool), ``phases`` and ``states``
             (the simulator's, before each action).
         attributes: numbers, strings and lists of strings, such as ``seed`` and ``model_file``.
+
+    Example:
+        >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.zeros(5)
+        >>> episode = Episode(
+        ...     observations=x, next_observations=x, actions=a, rewards=r, terminated=r > 0
+        ... )
+        >>> len(episode)
+        5
     """
 
     observations: Mapping[str, np.ndarray]
@@ -188,7 +196,17 @@ def stack_episodes(episodes: Iterable[Episode], *, task: int) -> TensorDict:
         batch ``[N]`` with the keys of :func:`as_tensordict` and ``task`` ``(N,)`` int64.
 
     Raises:
-        BMRLError: without episodes.
+        BMRLError: without episodes, or if a part of the observation is named like one of TorchRL's
+            keys, or like a path.
+
+    Example:
+        >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.zeros(5)
+        >>> episode = Episode(
+        ...     observations=x, next_observations=x, actions=a, rewards=r, terminated=r > 0
+        ... )
+        >>> data = stack_episodes([episode, episode], task=1)
+        >>> data.batch_size, data["episode"].unique().tolist()
+        (torch.Size([10]), [0, 1])
     """
     parts = [as_tensordict(episode, number=i) for i, episode in enumerate(episodes)]
     if not parts:

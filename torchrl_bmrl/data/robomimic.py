@@ -76,6 +76,18 @@ def open_episodes(
         DataError: naming file and key, for a missing or damaged file, a mask that is missing or
             names a demonstration that is, and, when an episode is read, for missing keys.
         ConfigError: if ``observation_keys`` is one text.
+
+    Example:
+        >>> import tempfile
+        >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.zeros(5)
+        >>> episode = Episode(
+        ...     observations=x, next_observations=x, actions=a, rewards=r, terminated=r > 0
+        ... )
+        >>> path = Path(tempfile.mkdtemp()) / "lift.hdf5"
+        >>> write_episodes(path, [episode] * 3, env_args={}, masks={"valid": [2]})
+        >>> with open_episodes(path, split="valid") as episodes:
+        ...     {name: len(episode) for name, episode in episodes.items()}
+        {'demo_2': 5}
     """
     if isinstance(observation_keys, str):
         raise ConfigError(f"observation_keys is {observation_keys!r}; valid: a list of names")
@@ -328,6 +340,18 @@ def write_episodes(
         DataError: for an episode that could not be trained on, without episodes, and if an extra is
             named like one of the layout's own arrays.
         ConfigError: if a mask has a position that no episode has.
+
+    Example:
+        >>> import tempfile
+        >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.zeros(5)
+        >>> episode = Episode(
+        ...     observations=x, next_observations=x, actions=a, rewards=r, terminated=r > 0
+        ... )
+        >>> path = Path(tempfile.mkdtemp()) / "lift.hdf5"
+        >>> env_args = {"env_name": "Lift", "type": 1, "env_version": "1.5", "env_kwargs": {}}
+        >>> write_episodes(path, [episode] * 2, env_args=env_args, masks={"train": range(2)})
+        >>> read_metadata(path)["masks"]
+        {'train': ['demo_0', 'demo_1']}
     """
     # HDF5's default structures have no checksums, these have; "latest" could only be read by the
     # very version that wrote it.

@@ -19,6 +19,28 @@ from torchrl_bmrl.errors import BMRLError, DataError
 Device = torch.device | str | None
 
 
+def read_memmap(path: Path) -> TensorDict:
+    """Memory-mapped tensors, and no objects beside them, which would be pickles.
+
+    Args:
+        path: their folder.
+
+    Raises:
+        DataError: if it holds a pickle, or is none of tensordict's folders.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "data"
+        >>> _ = TensorDict({"action": torch.ones(4, 2)}, [4]).memmap(path)
+        >>> read_memmap(path)["action"].shape
+        torch.Size([4, 2])
+    """
+    try:
+        return TensorDict.load_memmap(path, allow_pickle=False)
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DataError(path, None, f"no memory-mapped tensors alone ({error})") from error
+
+
 class TaskSampler(Sampler):
     """Draws, with replacement, from data sets that lie one after the other in a storage.
 
@@ -138,10 +160,13 @@ class DatasetBuffer(TensorDictReplayBuffer):
         path = Path(path).absolute()
         try:
             self.sampler.loads(path / "sampler")  # before the storage is overwritten
+            read_memmap(path / "storage")  # TorchRL's reader, next, would take pickles
             self.storage.loads(path / "storage")
             if self._rng is not None and (path / "rng_state").exists():
-                self._rng.set_state(TensorDict.load_memmap(path / "rng_state")["rng_state"])
-        except (OSError, RuntimeError, KeyError) as error:
+                self._rng.set_state(read_memmap(path / "rng_state")["rng_state"])
+        except BMRLError:
+            raise
+        except (OSError, RuntimeError, KeyError, ValueError) as error:
             raise DataError(path, None, f"not a dump of these data ({error})") from error
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

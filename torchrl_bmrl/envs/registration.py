@@ -8,7 +8,13 @@ from torchrl_bmrl.names import TASKS, gymnasium_id, horizon_of
 
 
 def register() -> None:
-    """Registers ``bmrl/SawyerReach-v0``, its five siblings and the compositions (idempotent)."""
+    """Registers ``bmrl/SawyerReach-v0``, its five siblings and the compositions (idempotent).
+
+    Example:
+        >>> register()
+        >>> gymnasium.spec("bmrl/SawyerReach-v0").kwargs["horizon"]
+        200
+    """
     for task in (*TASKS, "reach-lift-reach"):
         if gymnasium_id(task) not in gymnasium.registry:
             gymnasium.register(

@@ -70,7 +70,7 @@ class SinCosTransform(Transform):
         return self._call(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Two unit-bounded parts for the angles' one."""
+        """Two parts for the angles' one."""
         spec = observation_spec[self.in_keys[0]]
         del observation_spec[self.in_keys[0]]
         for key in self.out_keys:
@@ -225,6 +225,10 @@ class ObservationStatistics:
     Attributes:
         loc: mean.
         scale: standard deviation, at least 1e-3.
+
+    Example:
+        >>> ObservationStatistics(loc=torch.zeros(33), scale=torch.ones(33)).scale.shape
+        torch.Size([33])
     """
 
     loc: Tensor
@@ -234,6 +238,9 @@ class ObservationStatistics:
     def from_lists(cls, lists: Mapping[str, Sequence[float]]) -> ObservationStatistics:
         """Statistics as a checkpoint's metadata keep them.
 
+        Args:
+            lists: ``loc`` and ``scale``, as many numbers in each.
+
         Example:
             >>> ObservationStatistics.from_lists({"loc": [1.0], "scale": [2.0]})
             ObservationStatistics(loc=tensor([1.]), scale=tensor([2.]))
@@ -242,7 +249,11 @@ class ObservationStatistics:
 
     @classmethod
     def of(cls, datasets: Sequence[TensorDictBase]) -> ObservationStatistics:
-        """Statistics over all tasks together, each task with the same weight."""
+        """Statistics over all tasks together, each task with the same weight.
+
+        Args:
+            datasets: one batch ``[N_i]`` per task, with the named parts.
+        """
         raw = make_observation_transform()
         observations = [raw(data.copy()).get("observation").double() for data in datasets]
         loc = torch.stack([x.mean(0) for x in observations]).mean(0)
@@ -257,6 +268,13 @@ def make_observation_transform(statistics: ObservationStatistics | None = None) 
 
     Args:
         statistics: of the normalisation; ``None`` leaves the observation as it is.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_bmrl.data.schema import OBSERVATION_SHAPES
+        >>> parts = {name: torch.zeros(4, size) for name, size in OBSERVATION_SHAPES.items()}
+        >>> make_observation_transform()(TensorDict(parts, [4]))["observation"].shape
+        torch.Size([4, 33])
     """
     transforms: list[Transform] = [
         SinCosTransform("robot0_joint_pos", "sin_joint_pos", "cos_joint_pos"),
@@ -282,6 +300,19 @@ def transform_data(data: TensorDictBase, statistics: ObservationStatistics) -> T
         data: batch ``[N]`` with the named parts, as
             :func:`torchrl_bmrl.data.stack_episodes` returns it.
         statistics: of the normalisation.
+
+    Returns:
+        batch ``[N]`` with ``observation (N, 33)`` in place of the parts, now and under ``"next"``,
+        and what else there was.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_bmrl.data.schema import OBSERVATION_SHAPES
+        >>> parts = {name: torch.zeros(4, size) for name, size in OBSERVATION_SHAPES.items()}
+        >>> statistics = ObservationStatistics(torch.zeros(33), torch.ones(33))
+        >>> data = transform_data(TensorDict({**parts, "next": parts}, [4]), statistics)
+        >>> data["next", "observation"].shape
+        torch.Size([4, 33])
     """
     transform = make_observation_transform(statistics)
     after = transform(data.get("next").copy())
@@ -311,6 +342,11 @@ def make_env(
     Raises:
         UnknownNameError: for a name that is not a task.
         BMRLError: for ``num_envs`` below one.
+
+    Example:
+        >>> env = make_env("push_up", num_envs=2)
+        >>> env.rollout(3)["next", "observation"].shape
+        torch.Size([2, 3, 33])
     """
     # Imported here: the reading of data does not need the simulator.
     import gymnasium

@@ -37,6 +37,17 @@ class StageResult:
         agreement: adjusted mutual information by what the groups were found in.
         episodes: number of held-out episodes.
         transitions: number of their transitions on the way.
+
+    Example:
+        >>> result = StageResult(
+        ...     task="lift",
+        ...     phases=("descend", "grasp", "lift"),
+        ...     agreement={"embedding": Estimate(value=0.8, low=0.7, high=0.9)},
+        ...     episodes=1,
+        ...     transitions=2,
+        ... )
+        >>> print(result.agreement["embedding"])
+        0.80 [0.70, 0.90]
     """
 
     task: str
@@ -58,6 +69,18 @@ class GoalDistanceResult:
             successful episodes.
         episodes: number of held-out episodes.
         transitions: number of their transitions on the way.
+
+    Example:
+        >>> result = GoalDistanceResult(
+        ...     task="reach",
+        ...     correlation={"embedding": Estimate(value=0.9, low=0.8, high=1.0)},
+        ...     lowest=0.9,
+        ...     spread=None,
+        ...     episodes=2,
+        ...     transitions=80,
+        ... )
+        >>> print(result.correlation["embedding"])
+        0.90 [0.80, 1.00]
     """
 
     task: str
@@ -266,6 +289,9 @@ def mean_estimate(values: ArrayLike, *, seed: int = 0) -> Estimate:
     Args:
         values: One number per episode, shape ``(E,)``.
         seed: Seed of the resampling.
+
+    Raises:
+        BMRLError: if there is none, or one is not finite.
 
     Example:
         >>> print(mean_estimate([0.5, 0.5]))

@@ -48,7 +48,7 @@ RESULT_COLUMNS: Mapping[str, Callable[[str], Any]] = {
 }
 """Columns of ``results.csv``, and what makes a value of a text."""
 RESULT_FIELDS: tuple[str, ...] = tuple(RESULT_COLUMNS)
-"""Their names."""
+"""Names of the columns of ``results.csv``, in their order."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +63,13 @@ class ResultRow:
         episode: Number of the episode within its task, policy, source and seed.
         episode_return: Undiscounted sum of the rewards (column ``return``).
         success: Whether the task's goal was met at some step.
+
+    Example:
+        >>> row = ResultRow(
+        ...     task="lift", policy="bcq", seed=0, episode=3, episode_return=151.2, success=True
+        ... )
+        >>> row.episode_return, row.latent_source
+        (151.2, '')
     """
 
     task: str
@@ -89,6 +96,17 @@ class Summary:
         return_interval: 95% bootstrap interval of the mean return, stratified by seed.
         success_rate: Share of successful episodes, in [0, 1].
         success_interval: 95% bootstrap interval of the success rate, stratified by seed.
+
+    Example:
+        >>> rows = [
+        ...     ResultRow(
+        ...         task="lift", policy="bcq", seed=i, episode=0, episode_return=80.0, success=True
+        ...     )
+        ...     for i in range(2)
+        ... ]
+        >>> (summary,) = summarise(rows)
+        >>> summary.seeds, summary.success_rate, summary.return_interval
+        (2, 1.0, (80.0, 80.0))
     """
 
     task: str

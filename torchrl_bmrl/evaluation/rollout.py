@@ -22,6 +22,10 @@ class EpisodeOutcome:
         episode_return: sum of rewards over the horizon.
         success: whether the task's definition held at some step (robomimic's convention).
         stages: tasks of a composition that were done.
+
+    Example:
+        >>> EpisodeOutcome(episode_return=151.2, success=True)
+        EpisodeOutcome(episode_return=151.2, success=True, stages=0)
     """
 
     episode_return: float
@@ -55,6 +59,14 @@ def rollout_episodes(
 
     Raises:
         BMRLError: if there are more or fewer seeds than environments.
+
+    Example:
+        >>> from torchrl.envs.utils import RandomPolicy
+        >>> from torchrl_bmrl.envs.transforms import make_env
+        >>> env = make_env("reach", num_envs=2)
+        >>> policy = RandomPolicy(env.action_spec)
+        >>> rollout_episodes(env, policy, seed=[3, 4], max_steps=5).batch_size
+        torch.Size([2, 5])
     """
     seeds = [seed] if isinstance(seed, int) else list(seed)
     if len(seeds) != env.numel():
@@ -97,6 +109,14 @@ def evaluate_policy(
 
     Raises:
         BMRLError: if the seeds do not fill the environments.
+
+    Example:
+        >>> from torchrl.envs.utils import RandomPolicy
+        >>> from torchrl_bmrl.envs.transforms import make_env
+        >>> env = make_env("reach", num_envs=2)
+        >>> outcomes = evaluate_policy(env, RandomPolicy(env.action_spec), range(4), max_steps=5)
+        >>> [outcome.success for outcome in outcomes]
+        [False, False, False, False]
     """
     outcomes, size = [], env.numel()
     for first in range(0, len(seeds), size):

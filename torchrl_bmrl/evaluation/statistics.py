@@ -20,6 +20,10 @@ class Estimate:
         value: what was measured.
         low: lower end of the 95% bootstrap interval over episodes.
         high: upper end.
+
+    Example:
+        >>> print(Estimate(value=0.5, low=0.4, high=0.6))
+        0.50 [0.40, 0.60]
     """
 
     value: float

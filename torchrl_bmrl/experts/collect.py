@@ -42,6 +42,11 @@ class EpisodeJob:
         gains: of the expert.
         stepper: of :class:`~torchrl_bmrl.envs.sawyer.SawyerEnv`.
         after: tasks that the expert does before, joined by ``-``.
+
+    Example:
+        >>> job = EpisodeJob(task="lift", seed=0, noise=0.2, path=Path("00000.npz"))
+        >>> job.stepper, job.gains.grasp_steps
+        ('fast', 10)
     """
 
     task: str
@@ -86,6 +91,19 @@ def collect_episode(
         after: tasks that the expert does before, joined by ``-``: the episode begins where the last
             of them succeeded, with arm, gripper and cube as they are then. Empty: where the task
             itself begins.
+
+    Returns:
+        the episode, with the extras ``successes``, ``states`` and, of a task, ``phases``, of a
+        composition ``stages``.
+
+    Raises:
+        UnknownNameError: for a name that is not a task.
+        BMRLError: if the expert never does ``after``, in 100 starts.
+
+    Example:
+        >>> episode = collect_episode("reach", seed=0, noise=0.2, gains=ExpertGains())
+        >>> len(episode), bool(episode.extras["successes"].any())
+        (200, True)
     """
     env = _env(f"{after}-{task}" if after else task, stepper)
     scene = env.robosuite_env
@@ -191,6 +209,20 @@ def collect_demonstrations(
     Raises:
         UnknownNameError: for a name that is not a task.
         DataError: if a finished file holds another number of episodes than asked for.
+        StoppedError: if the run was asked to stop; the episodes that were finished are kept.
+
+    Example:
+        >>> import tempfile
+        >>> files = collect_demonstrations(
+        ...     Path(tempfile.mkdtemp()),
+        ...     {"reach": 1},
+        ...     valid_episodes=1,
+        ...     noise=0.2,
+        ...     seed=0,
+        ...     workers=1,
+        ... )
+        >>> files["reach"].name, count_episodes(files["reach"])
+        ('reach.hdf5', 2)
     """
     gains = gains or ExpertGains()
     files = {check_task(task): directory / f"{task}.hdf5" for task in episodes}

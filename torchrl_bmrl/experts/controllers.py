@@ -39,6 +39,11 @@ class ExpertGains:
         lift_height: height above its start that the cube is lifted to [m].
         push_line: distance from the table's centre along the direction to which the cube is
             pushed [m]. A line and not a distance from the cube's start, which no policy sees.
+
+    Example:
+        >>> gains = ExpertGains(speed_limit=0.5)
+        >>> gains.speed_limit, gains.position
+        (0.5, 4.0)
     """
 
     position: float = 4.0
@@ -59,6 +64,18 @@ class Expert:
     Args:
         env: the robosuite environment to control.
         gains: gains and limits.
+
+    Example:
+        >>> from torchrl_bmrl.envs.sawyer import SawyerEnv
+        >>> class Up(Expert):
+        ...     phases = ("up",)
+        ...
+        ...     def _target(self):
+        ...         return self.env.eef_position + np.array([0.0, 0.0, 0.1]), OPEN, 1.0
+        >>> env = SawyerEnv("lift")
+        >>> observation, info = env.reset(seed=0)
+        >>> Up(env.robosuite_env, ExpertGains())().tolist()
+        [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0]
     """
 
     phases: ClassVar[tuple[str, ...]]
@@ -256,8 +273,26 @@ def make_expert(
 ) -> Expert | ComposedExpert:
     """Scripted expert for a task's robosuite environment, or for a composition's.
 
+    Args:
+        task: one of the six, or a composition: several joined by ``-``.
+        env: the robosuite environment of that task, after a reset.
+        gains: gains and limits; ``None`` for the defaults.
+
+    Returns:
+        what gives an action (7,) in [-1, 1] when it is called, for the environment's present state.
+
     Raises:
         UnknownNameError: for a name that is not a task.
+
+    Example:
+        >>> from torchrl_bmrl.envs.sawyer import SawyerEnv
+        >>> env = SawyerEnv("lift")
+        >>> observation, info = env.reset(seed=0)
+        >>> expert = make_expert("lift", env.robosuite_env)
+        >>> for _ in range(5):
+        ...     observation, *_ = env.step(expert())
+        >>> expert.phases[expert.phase]
+        'descend'
     """
     gains = gains or ExpertGains()
     if len(composition_stages(task)) > 1:

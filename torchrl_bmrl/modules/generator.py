@@ -221,6 +221,19 @@ def make_decoder(
 
     The student of the distillation is such a decoder alone: it needs no encoder.
 
+    Args:
+        observation_dim: size of the observation.
+        action_dim: size of the action.
+        latent_dim: size of ``action_latent``.
+        task_latent_dim: size of ``task_latent``; 0 for a decoder that does not read it.
+        num_cells: widths of the hidden layers.
+        bounds: lower and upper bound of the action, numbers or ``(action_dim,)``; the output is
+            squashed between them.
+        in_keys: names of what is read, in the order above; ``None`` for those above.
+
+    Returns:
+        a module that writes ``action (*B, action_dim)``.
+
     Example:
         >>> make_decoder(3, 2, 4, task_latent_dim=2).in_keys
         ['observation', 'action_latent', 'task_latent']
@@ -243,6 +256,12 @@ def make_qvalue_network(
     """Critic from observation, action and, with ``task_latent_dim``, ``task_latent``.
 
     Writes ``state_action_value (*B, 1)``.
+
+    Args:
+        observation_dim: size of the observation.
+        action_dim: size of the action.
+        task_latent_dim: size of ``task_latent``; 0 for a critic that does not read it.
+        num_cells: widths of the hidden layers.
 
     Example:
         >>> make_qvalue_network(3, 2).in_keys
@@ -268,6 +287,13 @@ def make_perturbation_network(
 ) -> TensorDictModule:
     """Perturbation network: observation and action to ``perturbation (*B, action_dim)`` in [-1, 1].
 
+    Reference: Fujimoto et al. 2019, https://arxiv.org/abs/1812.02900, algorithm 1.
+
+    Args:
+        observation_dim: size of the observation.
+        action_dim: size of the action.
+        num_cells: widths of the hidden layers.
+
     Example:
         >>> make_perturbation_network(3, 2).out_keys
         ['perturbation']
@@ -286,7 +312,13 @@ def make_latent_actor(
     """Policy in the latent action space: observation to ``action_latent (*B, latent_dim)``.
 
     Reference: Zhou et al. 2020, https://arxiv.org/abs/2011.07213; as published, every dimension is
-    squashed into ±``max_latent``, in standard deviations of the prior.
+    squashed into ± ``max_latent``, in standard deviations of the prior.
+
+    Args:
+        observation_dim: size of the observation.
+        latent_dim: size of ``action_latent``, the generator's.
+        num_cells: widths of the hidden layers.
+        max_latent: bound on each dimension, positive.
 
     Example:
         >>> make_latent_actor(3, 4).out_keys

@@ -146,7 +146,11 @@ class HeldTaskLatent(Transform):
         return tensordict_reset.set("held_steps", steps)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Not defined outside an environment."""
+        """Not defined outside an environment.
+
+        Raises:
+            BMRLError: always.
+        """
         raise BMRLError("HeldTaskLatent acts in an environment, not on stored data")
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
@@ -157,7 +161,11 @@ class HeldTaskLatent(Transform):
         return input_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Adds ``held_steps``; the policy acts once, so that an m that it cannot take is named."""
+        """Adds ``held_steps``; the policy acts once, so that an m that it cannot take is named.
+
+        Raises:
+            BMRLError: if the policy was made for an m of another size.
+        """
         trial = observation_spec.zero()
         try:
             with torch.random.fork_rng(devices=[]):

@@ -105,6 +105,10 @@ class BCQPolicy(TensorDictModuleBase):
         """Policy of a trained :class:`~torchrl_bmrl.objectives.BCQLoss`, as a copy.
 
         Later updates of the loss do not reach the policy.
+
+        Args:
+            loss: whose generator, first critic and perturbation network act.
+            num_candidates: proposals per state.
         """
         generator = extract_network(loss, "generator")
         return cls(
@@ -198,7 +202,11 @@ class PLASPolicy(TensorDictModuleBase):
 
     @classmethod
     def from_loss(cls, loss: LossModule) -> PLASPolicy:
-        """Policy of a trained :class:`~torchrl_bmrl.objectives.PLASLoss`, as a copy."""
+        """Policy of a trained :class:`~torchrl_bmrl.objectives.PLASLoss`, as a copy.
+
+        Args:
+            loss: whose actor, generator and perturbation network act.
+        """
         generator, actor, perturbation = (
             extract_network(loss, name)
             for name in ("generator", "actor_network", "perturbation_network")
@@ -272,7 +280,11 @@ class DiscreteBCQPolicy(TensorDictModuleBase):
 
     @classmethod
     def from_loss(cls, loss: LossModule) -> DiscreteBCQPolicy:
-        """Policy of a trained :class:`~torchrl_bmrl.objectives.DiscreteBCQLoss`, as a copy."""
+        """Policy of a trained :class:`~torchrl_bmrl.objectives.DiscreteBCQLoss`, as a copy.
+
+        Args:
+            loss: whose generator and first critic act.
+        """
         return cls(
             extract_network(loss, "generator"),
             extract_critic(loss),
@@ -335,6 +347,10 @@ def extract_network(loss: LossModule, name: str) -> Any:
 
 def extract_critic(loss: LossModule, index: int = 0) -> TensorDictModule:
     """A stand-alone, frozen copy of one of a loss's critics.
+
+    Args:
+        loss: such as :class:`~torchrl_bmrl.objectives.BCQLoss`.
+        index: of the critic; policies act by the first, 0.
 
     Example:
         >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network

@@ -37,6 +37,12 @@ def make_task_encoder(
 
     Reference: *Compositional Skill Learning Using Batch Meta RL*, section 6.2.
 
+    Args:
+        observation_dim: size of the observation.
+        action_dim: size of the action.
+        task_latent_dim: size of m.
+        num_cells: widths of the hidden layers.
+
     Example:
         >>> make_task_encoder(3, 2).out_keys
         ['task_latent']
@@ -49,6 +55,9 @@ def make_one_hot_encoder(num_tasks: int) -> TensorDictModule:
     """In place of :func:`make_task_encoder`: m is the task's index, one-hot; nothing is learned.
 
     Reads ``task (*B,)``, int64; writes ``task_latent (*B, num_tasks)``.
+
+    Args:
+        num_tasks: number of tasks; ``task`` is below it.
 
     Example:
         >>> make_one_hot_encoder(3)(TensorDict({"task": torch.tensor([2])}, [1])).get("task_latent")
@@ -68,6 +77,12 @@ class _OneHot(torch.nn.Module):
 
 def make_task_classifier(num_tasks: int, task_latent_dim: int = 2) -> TensorDictModule:
     """Classifier :math:`P`: one linear layer from ``task_latent`` to ``task_logits``.
+
+    Reference: *Compositional Skill Learning Using Batch Meta RL*, section 6.2.
+
+    Args:
+        num_tasks: number of tasks, and so of logits.
+        task_latent_dim: size of m.
 
     Example:
         >>> make_task_classifier(6).out_keys
@@ -163,6 +178,15 @@ class OnlineTaskLatent(PrototypeTaskLatent):
     Args:
         encoder: :func:`make_task_encoder`'s module, trained.
         task_latent: the prototype of the first step, ``(m,)``.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
+        >>> online = OnlineTaskLatent(make_task_encoder(7, 7), torch.zeros(2))
+        >>> env = TransformedEnv(ContinuousActionVecMockEnv(), online)
+        >>> latent = env.rollout(3)["task_latent"]
+        >>> latent.shape, latent[0]
+        (torch.Size([3, 2]), tensor([0., 0.]))
     """
 
     def __init__(self, encoder: TensorDictModule, task_latent: Tensor) -> None:
@@ -246,6 +270,15 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
     Raises:
         BMRLError: for another alignment, a window below one, or a demonstration that is empty,
             lacks a key, has stages that go back, or sizes that the encoder does not take.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
+        >>> env = ContinuousActionVecMockEnv()
+        >>> source = DemonstrationTaskLatent(env.rollout(5), make_task_encoder(7, 7))
+        >>> latent = TransformedEnv(env, source).rollout(3)["task_latent"]
+        >>> torch.equal(latent, source.latents[:3])
+        True
     """
 
     def __init__(
@@ -342,7 +375,11 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
         return self._write(next_tensordict)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Not defined outside an environment: the alignment needs an episode."""
+        """Not defined outside an environment: the alignment needs an episode.
+
+        Raises:
+            BMRLError: always.
+        """
         raise BMRLError("DemonstrationTaskLatent acts in an environment, not on stored data")
 
 
@@ -394,5 +431,9 @@ class PathTaskLatent(PrototypeTaskLatent):
         return self._write(next_tensordict)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Not defined outside an environment: a path needs an episode."""
+        """Not defined outside an environment: a path needs an episode.
+
+        Raises:
+            BMRLError: always.
+        """
         raise BMRLError("PathTaskLatent acts in an environment, not on stored data")

@@ -28,6 +28,14 @@ class KeyedLoss(LossModule):
 
     Raises:
         UnknownNameError: for another ``reduction``.
+
+    Example:
+        >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
+        >>> from torchrl_bmrl.objectives import BCQLoss
+        >>> loss = BCQLoss(ActionVAE(3, 2), make_qvalue_network(3, 2), bounds=(-1.0, 1.0))
+        >>> loss.set_keys(reward="points")
+        >>> ("next", "points") in loss.in_keys, loss.out_keys[:2]
+        (True, ['loss_generator', 'loss_qvalue'])
     """
 
     def __init__(
@@ -43,7 +51,11 @@ class KeyedLoss(LossModule):
         self.use_prioritized_weights = use_prioritized_weights
 
     def register_coefficients(self, **values: float | None) -> None:
-        """Makes hyper-parameters buffers of the networks' type and device; ``None`` stays so."""
+        """Makes hyper-parameters buffers of the networks' type and device; ``None`` stays so.
+
+        Args:
+            **values: hyper-parameters by name.
+        """
         reference = next(self.parameters())
         for name, value in values.items():
             self.register_coeff_buffer(name, value, device=reference.device, dtype=reference.dtype)
@@ -105,6 +117,14 @@ class KeyedLoss(LossModule):
         return tensordict.get(self.tensor_keys.priority_weight, None)
 
     def reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """Reduces ``(*B,)`` with the data's masks and priority weights."""
+        """Reduces a loss with the data's masks and priority weights.
+
+        Args:
+            loss: of each row, ``(*B,)``.
+            tensordict: the data.
+
+        Returns:
+            ``()``; with ``reduction="none"`` a number for each row that the masks leave.
+        """
         weights = self._maybe_get_priority_weight(tensordict)
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights)

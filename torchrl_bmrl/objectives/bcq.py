@@ -34,7 +34,7 @@ class BCQLoss(GenerativeLoss):
     2. :meth:`qvalue_loss`: :math:`\sum_j (Q_j(s, a) - y)^2` with
        :math:`y = r + \gamma (1 - \mathrm{terminated}) \max_i
        [\lambda \min_j Q'_j(s', a_i) + (1 - \lambda) \max_j Q'_j(s', a_i)]`, where
-       :math:`a_i = G(s', z_i)`, :math:`z_i \sim N(0, I)` clipped to ±``latent_clip``
+       :math:`a_i = G(s', z_i)`, :math:`z_i \sim N(0, I)` clipped to ± ``latent_clip``
     3. :meth:`perturbation_loss` (only with a ``perturbation_network``):
        :math:`-Q_1(s, a + \phi\,\xi(s, a))` with :math:`a = G(s, z)`
 
@@ -210,6 +210,9 @@ class BCQLoss(GenerativeLoss):
 
     def perturbation_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Perturbation network's loss, -Q of the first critic; gradients reach it alone.
+
+        Returns:
+            the loss, and no metrics.
 
         Raises:
             BMRLError: if the loss was made without a perturbation network.

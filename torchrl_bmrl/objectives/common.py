@@ -59,6 +59,15 @@ class OfflineLoss(KeyedLoss):
 
     Raises:
         UnknownNameError: for another ``loss_function`` or ``reduction``.
+        BMRLError: for ``gamma`` outside [0, 1].
+
+    Example:
+        >>> from torchrl_bmrl.modules import make_qvalue_network
+        >>> loss = OfflineLoss(gamma=0.9)  # as a subclass does it
+        >>> loss.convert_critics(make_qvalue_network(3, 2), num_qvalue_nets=2)
+        >>> data = TensorDict({"observation": torch.zeros(8, 3), "action": torch.zeros(8, 2)}, [8])
+        >>> loss.qvalue(data).shape, loss.qvalue(data, target=True).shape
+        (torch.Size([2, 8]), torch.Size([2, 8]))
     """
 
     @dataclass
@@ -195,7 +204,11 @@ class OfflineLoss(KeyedLoss):
         }
 
     def critic(self, index: int = 0) -> tuple[TensorDictModule, TensorDictBase]:
-        """One critic: its module and the parameters that belong into it."""
+        """One critic: its module and the parameters that belong into it.
+
+        Args:
+            index: of the critic, below ``num_qvalue_nets``.
+        """
         if self._stacked:
             return self.qvalue_network, self.qvalue_network_params[index]
         params = self.qvalue_network_params["critics", str(index)]
@@ -236,7 +249,17 @@ class OfflineLoss(KeyedLoss):
     def call(
         self, name: str, tensordict: TensorDictBase, *, target: bool = False, frozen: bool = False
     ) -> TensorDictBase:
-        """Runs a network, its ``target``, or it ``frozen``; see :meth:`weights`."""
+        """Runs a network on data.
+
+        Args:
+            name: the network, such as ``"qvalue_network"``.
+            tensordict: what it reads; what it writes is added.
+            target: whether with its target's parameters.
+            frozen: whether without a gradient into its parameters, see :meth:`weights`.
+
+        Raises:
+            BMRLError: if the data do not fit the network.
+        """
         module = getattr(self, name)
         with holding(module, self.weights(name, target=target, frozen=frozen)):
             return read(module, tensordict)
@@ -249,7 +272,20 @@ class OfflineLoss(KeyedLoss):
         target: bool = False,
         frozen: bool = False,
     ) -> Tensor:
-        """One output of all critics, stacked in front."""
+        """One output of all critics, stacked in front.
+
+        Args:
+            tensordict: what they read, batch ``[*B]``.
+            key: the output.
+            target: whether with the targets' parameters.
+            frozen: whether without a gradient into their parameters.
+
+        Returns:
+            ``(num_qvalue_nets, *B, n)``.
+
+        Raises:
+            BMRLError: if the data do not fit the critics, or these do not write the key.
+        """
         network = self.qvalue_network
         inputs = tensordict.select(*network.in_keys)
         if not self._stacked:
@@ -280,7 +316,12 @@ class OfflineLoss(KeyedLoss):
     def qvalue(
         self, tensordict: TensorDictBase, *, target: bool = False, frozen: bool = False
     ) -> Tensor:
-        """Q of each critic, its ``target``, or it ``frozen``, ``(num_qvalue_nets, *B)``.
+        """Q of each critic, ``(num_qvalue_nets, *B)``.
+
+        Args:
+            tensordict: what the critics read, batch ``[*B]``.
+            target: whether with the targets' parameters.
+            frozen: whether without a gradient into their parameters.
 
         Raises:
             BMRLError: if the critics' output is not ``(*B, 1)``.
@@ -354,6 +395,10 @@ class OfflineLoss(KeyedLoss):
     def td_target(self, tensordict: TensorDictBase, next_value: Tensor) -> Tensor:
         """Target of the critics from the value of the next states, ``(*B,)``, without gradient.
 
+        Args:
+            tensordict: the data, with reward and flags under ``"next"``.
+            next_value: value of the next states, ``(*B,)``.
+
         Raises:
             BMRLError: for a reward or flag that is missing, not ``(*B, 1)`` or not finite.
         """
@@ -398,7 +443,11 @@ class OfflineLoss(KeyedLoss):
     # -- data ------------------------------------------------------------------------------------
 
     def batch_shape(self, tensordict: TensorDictBase) -> torch.Size:
-        """The shape ``*B`` of the data, told by the action; keyword calls have no batch size."""
+        """The shape ``*B`` of the data, told by the action; keyword calls have no batch size.
+
+        Raises:
+            BMRLError: if the data have no action, or no row.
+        """
         key = self.tensor_keys.action
         action = tensordict.get(key, None)
         if action is None:
@@ -411,6 +460,11 @@ class OfflineLoss(KeyedLoss):
         self, tensordict: TensorDictBase, keys: Iterable[NestedKey], *, after: bool = False
     ) -> TensorDictBase:
         """The entries of some keys, now or ``after`` the step, with the batch size ``*B``.
+
+        Args:
+            tensordict: the data.
+            keys: of the entries, as networks read them.
+            after: whether those under ``"next"``; they come back without that prefix.
 
         Raises:
             BMRLError: for a missing key, a number that is not finite, or another batch shape.

@@ -179,7 +179,11 @@ class DiscreteBCQLoss(OfflineLoss):
     # -- actions and values ----------------------------------------------------------------------
 
     def batch_shape(self, tensordict: TensorDictBase) -> torch.Size:
-        """The shape ``*B`` of the data, told by the action."""
+        """The shape ``*B`` of the data, told by the action.
+
+        Raises:
+            BMRLError: if the data have no action.
+        """
         key = self.tensor_keys.action
         action = tensordict.get(key, None)
         if action is None:
@@ -190,6 +194,10 @@ class DiscreteBCQLoss(OfflineLoss):
 
     def action_index(self, tensordict: TensorDictBase, num_actions: int) -> Tensor:
         """Index of the data's action, ``(*B,)``.
+
+        Args:
+            tensordict: the data.
+            num_actions: n, of which the action is one.
 
         Raises:
             BMRLError: for an action that is not written as ``action_space`` says.
@@ -209,14 +217,25 @@ class DiscreteBCQLoss(OfflineLoss):
         return action.long()
 
     def logits(self, tensordict: TensorDictBase, *, after: bool = False) -> Tensor:
-        """Logits of the generator at the state or the one ``after``, ``(*B, n)``."""
+        """Logits of the generator, ``(*B, n)``.
+
+        Args:
+            tensordict: the data.
+            after: whether at the next state.
+        """
         data = self.rows(tensordict, self.generator.in_keys, after=after)
         return output(self.call("generator", data), self.tensor_keys.logits, self.generator)
 
     def qvalue(
         self, tensordict: TensorDictBase, *, target: bool = False, frozen: bool = False
     ) -> Tensor:
-        """Value of every action under each critic, ``(num_qvalue_nets, *B, n)``."""
+        """Value of every action under each critic, ``(num_qvalue_nets, *B, n)``.
+
+        Args:
+            tensordict: what the critics read, batch ``[*B]``.
+            target: whether with the targets' parameters.
+            frozen: whether without a gradient into their parameters.
+        """
         key = self.tensor_keys.action_value
         return self.evaluate(tensordict, key, target=target, frozen=frozen)
 

@@ -326,7 +326,11 @@ class MetaDistillationLoss(KeyedLoss):
     # -- the parts of the objective --------------------------------------------------------------
 
     def embed(self, tensordict: TensorDictBase) -> Tensor:
-        """Embedding m of each row's context, ``(num_tasks, B, m)``."""
+        """Embedding m of each row's context, ``(num_tasks, B, m)``.
+
+        Raises:
+            BMRLError: for missing keys, and for ``context="previous"`` without ``"previous"``.
+        """
         keys = self.task_encoder.in_keys
         for key in keys:
             entry(tensordict, key)
@@ -390,7 +394,15 @@ class MetaDistillationLoss(KeyedLoss):
         return teachers(data, randomness=self.vmap_randomness, loop=self.deactivate_vmap)
 
     def imitate(self, taught: TensorDictBase, task_latent: Tensor) -> Tensor:
-        """Student's action for the teachers' observations and latents."""
+        """Student's action for the teachers' observations and latents.
+
+        Args:
+            taught: of :meth:`teach`.
+            task_latent: m, ``(num_tasks, B, m)``.
+
+        Returns:
+            ``(num_tasks, B, action_dim)``.
+        """
         data = taught.select(*self._teacher_observation_keys, self.tensor_keys.action_latent)
         data = data.copy().set(self.tensor_keys.task_latent, task_latent)
         action = self._run("student_generator", data, self.tensor_keys.action)
@@ -398,7 +410,16 @@ class MetaDistillationLoss(KeyedLoss):
         return action
 
     def judge(self, taught: TensorDictBase, action: Tensor, task_latent: Tensor) -> Tensor:
-        """Student's value of its own action, without a gradient into the action."""
+        """Student's value of its own action, without a gradient into the action.
+
+        Args:
+            taught: of :meth:`teach`.
+            action: of :meth:`imitate`.
+            task_latent: m, ``(num_tasks, B, m)``.
+
+        Returns:
+            ``(num_tasks, B, 1)``.
+        """
         keys = self.tensor_keys
         data = taught.select(*self._teacher_observation_keys).copy()
         data.set(keys.action, action.detach()).set(keys.task_latent, task_latent)
@@ -407,7 +428,14 @@ class MetaDistillationLoss(KeyedLoss):
         return value
 
     def classify(self, task_latent: Tensor) -> Tensor:
-        """Logits of the task, ``(num_tasks, B, num_tasks)``."""
+        """Logits of the task, ``(num_tasks, B, num_tasks)``.
+
+        Args:
+            task_latent: m, ``(num_tasks, B, m)``.
+
+        Raises:
+            BMRLError: if the classifier knows another number of tasks.
+        """
         keys = self.tensor_keys
         data = TensorDict({keys.task_latent: task_latent}, task_latent.shape[:-1])
         logits = self._run("task_classifier", data, keys.task_logits)
@@ -419,7 +447,14 @@ class MetaDistillationLoss(KeyedLoss):
         return logits
 
     def separate(self, task_latent: Tensor) -> Tensor:
-        """Triplet error of each row's m against another row of its task and one of another."""
+        """Triplet error of each row's m against another row of its task and one of another.
+
+        Args:
+            task_latent: m, ``(num_tasks, B, m)``.
+
+        Returns:
+            ``(num_tasks, B)``.
+        """
         num_tasks, rows = task_latent.shape[:2]
         device = task_latent.device
         # A cyclic shift by 1 to n - 1 is never the row, or the task, itself.
@@ -445,7 +480,11 @@ class MetaDistillationLoss(KeyedLoss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Computes the weighted terms; see the class for keys."""
+        """Computes the weighted terms; see the class for keys.
+
+        Raises:
+            BMRLError: for data that do not fit, as the class says.
+        """
         if tensordict.ndim != 2 or tensordict.batch_size[0] != self.num_tasks:
             raise BMRLError(
                 f"the data's batch size is {list(tensordict.batch_size)}; valid: "

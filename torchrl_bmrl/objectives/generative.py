@@ -40,6 +40,10 @@ class GenerativeLoss(OfflineLoss):
     It brings the autoencoder's own loss, :meth:`generator_loss`, and the way from a latent to an
     action, :meth:`propose`, :meth:`decode` and :meth:`perturb`. The generator has no target.
 
+    Reference: Kingma and Welling, *Auto-Encoding Variational Bayes*, ICLR 2014,
+    https://arxiv.org/abs/1312.6114, conditioned on the state as in BCQ,
+    https://arxiv.org/abs/1812.02900.
+
     Args:
         generator: a module with two :class:`~tensordict.nn.TensorDictModule` children: ``encoder``
             (observation, action → ``action_latent_loc``, ``action_latent_scale``) and ``decoder``
@@ -59,6 +63,16 @@ class GenerativeLoss(OfflineLoss):
     Raises:
         BMRLError: for a generator without encoder, decoder and ``latent_dim``, bounds and spec
             given together or not at all, or an unknown ``kl_reduction``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
+        >>> loss = GenerativeLoss(ActionVAE(3, 2), bounds=(-1.0, 1.0))  # as a subclass does it
+        >>> loss.convert_critics(make_qvalue_network(3, 2), num_qvalue_nets=2)
+        >>> data = TensorDict({"observation": torch.zeros(8, 3), "action": torch.zeros(8, 2)}, [8])
+        >>> value, metrics = loss.generator_loss(data)
+        >>> value.shape, sorted(metrics)
+        (torch.Size([]), ['kl_divergence', 'reconstruction_error'])
     """
 
     @dataclass
@@ -150,6 +164,13 @@ class GenerativeLoss(OfflineLoss):
         """The observation with the latent and the action that the generator decodes from it.
 
         A gradient may reach the latent, never the generator.
+
+        Args:
+            observation: what the decoder reads beside z, batch ``[*B]``.
+            latent: z, ``(*B, latent_dim)``.
+
+        Raises:
+            BMRLError: if they do not fit the decoder.
         """
         data = observation.copy().set(self.tensor_keys.action_latent, latent)
         with holding(self.generator, self.weights("generator", frozen=True)):
@@ -158,7 +179,13 @@ class GenerativeLoss(OfflineLoss):
     def propose(
         self, observation: TensorDictBase, latent_clip: float | Tensor | None
     ) -> TensorDictBase:
-        """The observation with an action decoded from z ~ N(0, I) within ±``latent_clip``."""
+        """The observation with an action decoded from z ~ N(0, I) within ± ``latent_clip``.
+
+        Args:
+            observation: what the decoder reads beside z, batch ``[*B]``; every row gets a z of its
+                own, so that of an observation expanded to candidates these differ.
+            latent_clip: bound on each dimension of z, ``None`` for none.
+        """
         latent = sample_action_latent(
             (*observation.batch_size, self.generator.latent_dim),
             latent_clip=latent_clip,
@@ -168,7 +195,15 @@ class GenerativeLoss(OfflineLoss):
         return self.decode(observation, latent)
 
     def perturb(self, tensordict: TensorDictBase, *, target: bool = False) -> TensorDictBase:
-        """Moves the action by the perturbation network or its ``target``, if there is one."""
+        """Moves the action by the perturbation network, if there is one.
+
+        Args:
+            tensordict: observation and action, batch ``[*B]``.
+            target: whether by the network's target.
+
+        Raises:
+            BMRLError: if the perturbation has another shape than the action.
+        """
         if self.perturbation_network is None:
             return tensordict
         keys = self.tensor_keys
@@ -184,10 +219,19 @@ class GenerativeLoss(OfflineLoss):
     # -- loss ------------------------------------------------------------------------------------
 
     def generator_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Variational autoencoder's loss; gradients reach the generator alone.
+        r"""Variational autoencoder's loss; gradients reach the generator alone.
+
+        .. math:: \lVert G(s, z) - a \rVert^2 / |a|
+            + \beta\, \mathrm{KL}(q(z|s,a)\,\|\,N(0, I)) / |z|,\quad z \sim q(z|s,a)
+
+        With ``kl_reduction="sum"`` the divergence is not divided by :math:`|z|`.
 
         Returns:
             the loss and, detached, ``reconstruction_error`` and ``kl_divergence``.
+
+        Raises:
+            BMRLError: for data with missing keys, other shapes or, on CPU and not compiled, numbers
+                that are not finite.
         """
         keys = self.tensor_keys
         data = self.rows(

@@ -158,7 +158,12 @@ class PLASLoss(GenerativeLoss):
     # -- losses, in update order; generator_loss is the base's -----------------------------------
 
     def act(self, observation: TensorDictBase, *, target: bool = False) -> TensorDictBase:
-        """The observation with the policy's, or its ``target``'s, action."""
+        """The observation with the policy's action.
+
+        Args:
+            observation: what policy and decoder read, batch ``[*B]``.
+            target: whether the action is the target policy's.
+        """
         acted = self.call("actor_network", observation.copy(), target=target)
         latent = output(acted, self.tensor_keys.action_latent, self.actor_network)
         decoded = self.decode(observation, latent)
@@ -190,7 +195,11 @@ class PLASLoss(GenerativeLoss):
         return result
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """-Q of the first critic at the policy's action; trains policy and perturbation alone."""
+        """-Q of the first critic at the policy's action; trains policy and perturbation alone.
+
+        Returns:
+            the loss, and no metrics.
+        """
         acted = self.act(self.rows(tensordict, self.observation_keys))
         value = self.qvalue(acted, frozen=True)[0]
         loss = self.reduce(-value, tensordict)

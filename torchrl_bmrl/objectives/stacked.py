@@ -122,7 +122,14 @@ class StackedLoss(LossModule):
         return super()._apply(fn)
 
     def member(self, index: int) -> LossModule:
-        """One of the losses that the stack was made of, with its present parameters."""
+        """One of the losses that the stack was made of, with its present parameters.
+
+        Args:
+            index: its position.
+
+        Returns:
+            the loss itself; later updates of the stack do not reach it until it is asked for again.
+        """
         loss = self._losses[index]
         own = _state(loss)
         with torch.no_grad():
@@ -131,7 +138,11 @@ class StackedLoss(LossModule):
         return loss
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Every loss and metric of every member, each ``[N]``; see the members' class for keys."""
+        """Every loss and metric of every member, each ``[N]``; see the members' class for keys.
+
+        Raises:
+            BMRLError: for data without a row per member, or that do not fit the members.
+        """
         priority = self._template.tensor_keys.priority
 
         def run(loss: LossModule, data: TensorDictBase) -> tuple[dict[str, Tensor], Tensor | None]:

@@ -91,7 +91,11 @@ class Embeddings:
                 )
 
     def rows(self, keep: NDArray[Any]) -> Embeddings:
-        """Some of the rows, by mask or by index."""
+        """Some of the rows, by mask or by index.
+
+        Args:
+            keep: mask ``(N,)``, or indices.
+        """
         columns = [f.name for f in fields(self) if f.name not in ("phase_names", "baselines")]
         return replace(
             self,
@@ -120,6 +124,9 @@ class Embeddings:
 
         Those on the way of its successful episodes and :data:`STAGE_TAIL` steps more. In an episode
         that fails its first stages go on to the end, two hundred steps beside forty.
+
+        Args:
+            task: its name.
         """
         way = self.on_the_way(task, tail=STAGE_TAIL)
         return way.rows(np.isin(way.episode, way.episode[way.success]))

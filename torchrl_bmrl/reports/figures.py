@@ -47,6 +47,9 @@ def stage1_curves(
     Returns:
         PNG image.
 
+    Raises:
+        BMRLError: if there is no curve of one of the six tasks.
+
     Example:
         >>> returns = np.array([90.0, 110.0])
         >>> stage1_curves({"reach": [(1, 500, returns), (2, 1000, returns + 20)]})[1:4]
@@ -97,6 +100,9 @@ def embedding_scatter(task_latent: NDArray[Any], task: NDArray[np.integer[Any]])
     Returns:
         PNG image.
 
+    Raises:
+        BMRLError: if a class index is none of the tasks'.
+
     Example:
         >>> embedding_scatter(np.eye(3, 2), np.array([0, 1, 5]))[1:4]
         b'PNG'
@@ -122,6 +128,9 @@ def embedding_tsne(
 
     Returns:
         PNG image.
+
+    Raises:
+        BMRLError: for less than 4 transitions, or a class index that is none of the tasks'.
 
     Example:
         >>> points = np.random.default_rng(0).normal(size=(20, 2))
@@ -156,6 +165,9 @@ def embedding_stages(
 
     Returns:
         PNG image.
+
+    Raises:
+        BMRLError: for less than 4 transitions.
 
     Example:
         >>> points = np.random.default_rng(0).normal(size=(20, 2))
@@ -210,6 +222,9 @@ def reach_trajectories(
 
     Returns:
         PNG image.
+
+    Raises:
+        BMRLError: without transitions.
 
     Example:
         >>> line = np.linspace(0.0, 1.0, 8)

@@ -114,6 +114,12 @@ class Section:
         tables: Tables.
         explorer: What can be explored.
         pictures: Pictures.
+
+    Example:
+        >>> table = Table(title="T", caption="C", header=("Task",), rows=[("Lift",)])
+        >>> section = Section(heading="Results", paragraphs=["All of them."], tables=[table])
+        >>> len(section.tables), section.explorer
+        (1, None)
     """
 
     heading: str

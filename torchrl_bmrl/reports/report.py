@@ -99,6 +99,17 @@ def write_report(
 
     Raises:
         DataError: if ``results.csv``, a file of training curves or a study is missing or not valid.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl_bmrl.evaluation import ResultRow, write_results
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> row = ResultRow(
+        ...     task="lift", policy="bcq", seed=0, episode=0, episode_return=80.0, success=True
+        ... )
+        >>> write_results(folder / "results.csv", [row])
+        >>> write_report(folder, default_source="prototype", facts={"seed": "0"}).name
+        'report.html'
     """
     run_dir = Path(run_dir)
     summaries = summarise(read_results(run_dir / "results.csv"))

@@ -95,6 +95,9 @@ class Table:
 def task_name(task: str) -> str:
     """A task's name as the paper prints it.
 
+    Args:
+        task: one of :data:`torchrl_bmrl.names.TASKS`.
+
     Example:
         >>> task_name("push_left")
         'Push Left'
