@@ -48,6 +48,16 @@ def test_links_to_files_lead_somewhere(page: Path) -> None:
         assert (page.parent / target).exists(), target
 
 
+def test_the_page_of_runs_names_every_setting_that_is_free_to_change() -> None:
+    pytest.importorskip("yaml")
+    from torchrl_bmrl.runs import FREE_TO_CHANGE
+
+    text = (ROOT / "docs" / "runs.md").read_text()
+    _, _, rest = text.partition("Free to change are ")
+    named = re.findall(r"`(\w+)`", rest.partition(".\n")[0])
+    assert sorted(named) == sorted(FREE_TO_CHANGE)
+
+
 # -- commands --------------------------------------------------------------------------------------
 
 COMMANDS = [
