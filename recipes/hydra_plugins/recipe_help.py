@@ -7,6 +7,9 @@ import sys
 from omegaconf import OmegaConf
 
 # Of the script that was started. What looks like a variable there is not one of Hydra's template.
+# Replaced: in a launcher's process Hydra imports this anew for each job.
 OmegaConf.register_new_resolver(
-    "recipe", lambda: (sys.modules["__main__"].__doc__ or "").strip().replace("$", "$$")
+    "recipe",
+    lambda: (sys.modules["__main__"].__doc__ or "").strip().replace("$", "$$"),
+    replace=True,
 )
