@@ -52,7 +52,7 @@ from torchrl_bmrl.training import make_adam
 
 TRIED = settings(
     max_examples=120,
-    deadline=10_000,  # milliseconds, of one: none hangs
+    deadline=None,  # what hangs meets the timeout of every test; no time is asserted here
     derandomize=True,  # the same in every run
     database=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],

@@ -28,7 +28,6 @@ from torchrl_bmrl.data.robosuite import (
     Relabelling,
     _gripper_commands,
     open_episodes,
-    relabelling_table,
 )
 from torchrl_bmrl.envs.tasks import make_robosuite_env
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
@@ -118,6 +117,11 @@ def human_copy(human: Path, tmp_path: Path) -> Path:
 def read(path: Path, name: str = "demo_1", task: str = "lift", **options: Any) -> Episode:
     with open_episodes(path, task=task, **options) as episodes:
         return episodes[name]
+
+
+def relabelling_table(path: Path, **options: Any) -> list[Relabelling]:
+    with open_episodes(path, **options) as episodes:
+        return [Relabelling.of(name, episode) for name, episode in episodes.items()]
 
 
 def edit(path: Path, change: Callable[[np.ndarray], np.ndarray | None]) -> None:

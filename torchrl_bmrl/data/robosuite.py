@@ -159,12 +159,6 @@ def open_episodes(
         yield LazyEpisodes(names, read)
 
 
-def relabelling_table(path: str | Path, *, task: str, tracking: float = 1.0) -> list[Relabelling]:
-    """What becomes of every demonstration of a file; see :func:`open_episodes`."""
-    with open_episodes(path, task=task, tracking=tracking) as episodes:
-        return [Relabelling.of(name, episode) for name, episode in episodes.items()]
-
-
 # -- from one model to the other -------------------------------------------------------------------
 
 
