@@ -39,7 +39,7 @@ from torchrl_bmrl.evaluation import (
 )
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
 from torchrl_bmrl.health import check_metrics
-from torchrl_bmrl.names import HORIZON, TASKS
+from torchrl_bmrl.names import TASKS, horizon_of
 from torchrl_bmrl.parallel import Report, run_jobs
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
@@ -195,7 +195,7 @@ def baselines(config: Config) -> None:
         evaluate_job,
         played,
         workers=config.workers,
-        total=len(played) * config.evaluate.episodes * HORIZON,
+        total=sum(config.evaluate.episodes * horizon_of(task) for *_, task in played),
         description="evaluating baselines",
         unit="step",
     )

@@ -42,7 +42,7 @@ from torchrl_bmrl.evaluation.rollout import EpisodeOutcome, evaluate_policy
 from torchrl_bmrl.experts.collect import collect_episode
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
-from torchrl_bmrl.names import HORIZON, TASKS
+from torchrl_bmrl.names import TASKS, horizon_of
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
 from torchrl_bmrl.reports import Embeddings, write_report
 from torchrl_bmrl.reports.films import explore_demonstrations
@@ -71,7 +71,7 @@ def keep_rows(
     name = "-".join(filter(None, (task, policy_name, source)))
     path = Path(config.run_dir) / "evaluation" / f"{name}.csv"
     if path.exists():
-        report(config.evaluate.episodes * HORIZON)
+        report(config.evaluate.episodes * horizon_of(task))
         tell(config, f"{path}: read back")
         return read_results(path)
     seeds = [derive_seed(config.seed, "evaluate", task, i) for i in range(config.evaluate.episodes)]
@@ -136,7 +136,7 @@ def evaluate_job(job: tuple[Config, str, str, str], report: Report) -> list[Resu
     def outcomes(seeds: list[int]) -> list[EpisodeOutcome]:
         if policy_name == "expert":
             played = expert_outcomes(config, task, seeds)
-            report(len(seeds) * HORIZON)
+            report(len(seeds) * horizon_of(task))
             return played
         if policy_name == "bcq":
             loss, _ = load_bcq_loss(run_dir / "bcq" / task / "checkpoint.safetensors")
@@ -247,7 +247,7 @@ def evaluate(config: Config) -> None:
         evaluate_job,
         jobs,
         workers=config.workers,
-        total=len(jobs) * config.evaluate.episodes * HORIZON,
+        total=sum(config.evaluate.episodes * horizon_of(task) for _, task, *_ in jobs),
         description="evaluating",
         unit="step",
     )

@@ -51,7 +51,7 @@ from torchrl_bmrl.evaluation.paths import data_path, straight_path, switched_pat
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
 from torchrl_bmrl.files import number, read_rows, whole, write_rows
 from torchrl_bmrl.modules import BCQPolicy, PathTaskLatent
-from torchrl_bmrl.names import HORIZON, TASKS
+from torchrl_bmrl.names import TASKS, horizon_of
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
 from torchrl_bmrl.reports import Picture, Section, Table, write_study
 from torchrl_bmrl.reports.figures import behaviour_trajectories, embedding_paths
@@ -171,8 +171,8 @@ def embedding_points(
     kind, _, moving = method.partition("_")
     names = [others[i] for i in towards]
     if moving:
-        paths = make_paths(config, student, kind, HORIZON)
-        along = np.tile(np.linspace(0, 1, HORIZON), (count, 1))
+        paths = make_paths(config, student, kind, horizon_of(task))
+        along = np.tile(np.linspace(0, 1, horizon_of(task)), (count, 1))
         return np.stack([paths[i] for i in towards]), along, names
     # Episodes of a path hold one point each: from the first after the prototype to the other end.
     levels = -(-count // len(others))
@@ -281,7 +281,8 @@ def job_files(job: Job) -> list[Path]:
 
 def job_size(job: Job) -> int:
     """Steps of a job."""
-    return len(job_files(job)) * job[0].interpolation.episodes * HORIZON
+    settings = job[0].interpolation
+    return len(job_files(job)) * settings.episodes * horizon_of(settings.task)
 
 
 def run_job(job: Job, report: Report) -> None:

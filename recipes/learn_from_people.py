@@ -35,7 +35,7 @@ from torchrl_bmrl.evaluation import bootstrap_interval
 from torchrl_bmrl.evaluation.rollout import evaluate_policy
 from torchrl_bmrl.files import finite, read_rows, whole, write_atomic, write_rows
 from torchrl_bmrl.modules import BCQPolicy
-from torchrl_bmrl.names import HORIZON
+from torchrl_bmrl.names import horizon_of
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
 
 TASK = "lift"
@@ -89,7 +89,7 @@ def evaluate_job(job: Job, report: Report) -> list[dict]:
         ]
         write_rows(path, rows)
     else:
-        report(config.evaluate.episodes * HORIZON)
+        report(config.evaluate.episodes * horizon_of(TASK))
     columns = {"training_seed": whole, "episode": whole, "success": whole}
     return read_rows(path, {"share": finite, **columns, "return": finite})
 
@@ -151,7 +151,7 @@ def learn_from_people(config: Config) -> None:
         evaluate_job,
         agents,
         workers=config.workers,
-        total=config.evaluate.episodes * HORIZON * len(agents),
+        total=config.evaluate.episodes * horizon_of(TASK) * len(agents),
         description="evaluating",
         unit="step",
     )
