@@ -16,7 +16,6 @@ import os
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -25,6 +24,15 @@ from typing import Any
 import hydra
 import numpy as np
 import torch
+from interpolation_report import (
+    METHODS,
+    SWITCH_STEPS,
+    SWITCHES,
+    Episodes,
+    make_pictures,
+    method_table,
+    switching_table,
+)
 from omegaconf import DictConfig
 from settings import Config, run_recipe
 from tensordict import TensorDictBase
@@ -33,53 +41,19 @@ from torch import Tensor
 
 from torchrl_bmrl.agents import Student, load_student
 from torchrl_bmrl.data.demonstrations import load_transitions, read_statistics
-from torchrl_bmrl.envs.tasks import CONTROL_FREQUENCY
 from torchrl_bmrl.envs.transforms import make_env
 from torchrl_bmrl.errors import ConfigError
-from torchrl_bmrl.evaluation import bootstrap_interval
-from torchrl_bmrl.evaluation.behaviour import (
-    CUBE_OUTCOMES,
-    cube_outcomes,
-    effective_number,
-    group_coverage,
-    matching_noise,
-    mean_speed,
-    occupied_cells,
-    spread,
-)
+from torchrl_bmrl.evaluation.behaviour import matching_noise
 from torchrl_bmrl.evaluation.paths import data_path, straight_path, switched_path
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
 from torchrl_bmrl.files import number, read_rows, whole, write_rows
 from torchrl_bmrl.modules import BCQPolicy, PathTaskLatent
-from torchrl_bmrl.names import TASKS, horizon_of
+from torchrl_bmrl.names import horizon_of
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
-from torchrl_bmrl.reports import Picture, Section, Table, write_study
-from torchrl_bmrl.reports.figures import behaviour_trajectories, embedding_paths
-from torchrl_bmrl.reports.tables import MISSING
+from torchrl_bmrl.reports import Section, write_study
 
-METHODS = {
-    "prototype": "Nothing: the task's prototype",
-    "tasks": "Every task's prototype",
-    "straight": "Points of straight lines",
-    "curve": "Points of curves on the data",
-    "random": "Random points",
-    "curve_moving": "Along curves on the data in time",
-    "actions": "Random actions",
-}
-"""Where m comes from, or the action, by the method's name."""
 WITH_NOISE = ("straight", "random")
 """Methods beside which action noise of the same size is played."""
-SWITCHES = {
-    "stay": "One demonstration to the end",
-    "switch": "Another one from halfway on",
-    "leave": "Another task's prototype from halfway on",
-}
-SWITCH_STEPS = 3
-"""Steps of the straight line between two demonstrations; a reach arrives after about eleven."""
-CELL = 0.04
-"""Edge of the cells that are counted [m]."""
-GROUP = 5
-"""Episodes whose cells are counted together."""
 POSITIONS = {"eef": ["eef_x", "eef_y", "eef_z"], "cube": ["goal_x", "goal_y", "goal_z"]}
 # The parts of the observation that these are, see OBSERVATION_PARTS.
 COLUMNS = {"eef": slice(23, 26), "cube": slice(30, 33)}
@@ -311,7 +285,7 @@ def run_job(job: Job, report: Report) -> None:
     write_rows(files[0], make_rows(played, along, labels))
 
 
-def read_episodes(path: Path) -> dict[str, np.ndarray]:
+def read_episodes(path: Path) -> Episodes:
     """What :func:`make_rows` made, as arrays ``(N, T, ...)``; labels ``(N,)``."""
     positions = [name for names in POSITIONS.values() for name in names]
     measured = [*positions, "along", "deviation", "success"]
@@ -326,159 +300,6 @@ def read_episodes(path: Path) -> dict[str, np.ndarray]:
     episodes = {name: column(*columns) for name, columns in POSITIONS.items()}
     episodes |= {name: column(name)[..., 0] for name in ("along", "deviation", "success")}
     return episodes | {"label": np.array([row["label"] for row in rows if row["step"] == 0])}
-
-
-# -- what came of it -------------------------------------------------------------------------------
-
-
-def moved(episodes: Mapping[str, np.ndarray], name: str) -> np.ndarray:
-    """Positions relative to where each episode began: the starts differ, and are no behaviour."""
-    return episodes[name] - episodes[name][:, :1]
-
-
-def with_interval(values: np.ndarray, form: str) -> str:
-    """Mean and its bootstrap interval."""
-    low, high = bootstrap_interval(values)
-    return f"{values.mean():{form}} [{low:{form}}, {high:{form}}]"
-
-
-def share_of_neither(config: Config, episodes: Mapping[str, np.ndarray], tasks: Mapping) -> str:
-    """Share of episodes in which the cube fares as at neither end of the episode's path."""
-    labels = list(zip(tasks["label"], cube_outcomes(moved(tasks, "cube")), strict=True))
-    usual = {
-        task: Counter(outcome for label, outcome in labels if label == task).most_common(1)[0][0]
-        for task in {label for label, _ in labels}
-    }
-    ends = {task: (usual[config.interpolation.task], usual[task]) for task in usual}
-    outcomes = zip(episodes["label"], cube_outcomes(moved(episodes, "cube")), strict=True)
-    return f"{np.mean([outcome not in ends[label] for label, outcome in outcomes]):.0%}"
-
-
-def method_table(config: Config, played: Mapping[str, dict[str, np.ndarray]]) -> Table:
-    """Behaviour of every method, one line each."""
-    group = min(GROUP, config.interpolation.episodes)
-    cube = config.interpolation.task != "reach"
-    known = {tuple(cell) for cell in occupied_cells(moved(played["tasks"], "eef"), CELL)}
-    lines = []
-    for name, episodes in played.items():
-        eef = moved(episodes, "eef")
-        cells = {tuple(cell) for cell in occupied_cells(eef, CELL)}
-        if name.endswith("_noise"):
-            title = f"Action noise, as far as: {METHODS[name.removesuffix('_noise')].lower()}"
-        else:
-            title = METHODS[name]
-        line = [title, str(len(eef)), f"{episodes['deviation'].mean():.2f}"]
-        line += [with_interval(group_coverage(eef, CELL, group_size=group), ".0f")]
-        line += [str(len(cells)), str(len(cells - known)), f"{spread(eef[:, -1]):.3f}"]
-        line += [with_interval(mean_speed(eef, 1 / CONTROL_FREQUENCY), ".3f")]
-        if cube:
-            displacement = moved(episodes, "cube")
-            covered = group_coverage(displacement, CELL, group_size=group)
-            outcomes = cube_outcomes(displacement)
-            shares = {kind: outcomes.count(kind) / len(outcomes) for kind in CUBE_OUTCOMES}
-            line += [with_interval(covered, ".0f"), f"{1 - shares['still']:.0%}"]
-            line += [f"{effective_number(outcomes):.1f}"]
-            between = name in ("straight", "curve", "curve_moving")
-            line += [share_of_neither(config, episodes, played["tasks"]) if between else MISSING]
-            line += [", ".join(f"{kind} {x:.0%}" for kind, x in shares.items() if x)]
-        else:
-            line += [MISSING] * 5
-        lines.append(line)
-    return Table(
-        title=f"Interpolation as exploration, in the scene of {config.interpolation.task}",
-        caption=(
-            "Size: mean norm of the executed action minus the policy's at the scene's prototype "
-            f"in the same state, from the same proposals. Cells: of {CELL * 100:.0f} cm, of "
-            f"positions relative to the episode's start; “cells of {group}” are those that "
-            f"{group} episodes occupy together. New: cells of all episodes in which no episode of "
-            "any task's prototype was. Spread: root mean square distance of the final "
-            "end-effector positions from their mean. Kinds: effective number of outcomes, of what "
-            f"may become of the cube: {', '.join(CUBE_OUTCOMES)}. Neither: episodes with an "
-            "outcome that is usual at neither end of their path. "
-            "Brackets: 95% bootstrap intervals over episodes, or over groups."
-        ),
-        header=(
-            "Method", "Episodes", "Size", f"Cells of {group}", "Cells of all", "New",
-            "Spread [m]", "Speed [m/s]", f"Cube's cells of {group}", "Cube moved", "Kinds",
-            "Neither", "Outcomes",
-        ),
-        rows=lines,
-    )  # fmt: skip
-
-
-def switching_table(played: Mapping[str, dict[str, np.ndarray]]) -> Table:
-    """Whether reach episodes arrive, with and without a switch."""
-    lines = []
-    for name, episodes in played.items():
-        success = episodes["success"].astype(bool)
-        leaving = episodes["label"].astype(int)
-        early = [success[i, : leaving[i]].any() for i in range(len(success))]
-        apart = np.linalg.norm(episodes["eef"] - played["stay"]["eef"], axis=-1)
-        first = success.argmax(1)[success.any(1)] / CONTROL_FREQUENCY
-        lines.append(
-            [
-                SWITCHES[name],
-                str(len(success)),
-                with_interval(success.any(1).astype(float), ".2f"),
-                with_interval(success[:, -1].astype(float), ".2f"),
-                str(sum(early)),
-                f"{np.median(first):.2f}" if len(first) else MISSING,
-                f"{apart.max(1).mean():.4f}",
-            ]
-        )
-    return Table(
-        title="From one reach trajectory to another",
-        caption=(
-            "Reach episodes from new starts to new goals, driven by the embeddings of held-out "
-            f"demonstrations; halfway to the first one's success m goes in {SWITCH_STEPS} steps "
-            "along a straight line to the second one's. Arrived: within 2 cm of the episode's own "
-            "goal at some step; there: at the last one. Apart: the end-effector's largest distance "
-            "from where it is without leaving, mean over episodes; where that is next to nothing, "
-            "two demonstrations are one behaviour. Brackets: 95% bootstrap intervals."
-        ),
-        header=(
-            "m", "Episodes", "Arrived", "There at the end", "Arrived before", "After [s]",
-            "Apart [m]",
-        ),
-        rows=lines,
-    )  # fmt: skip
-
-
-def draw(config: Config, played: Mapping[str, dict[str, np.ndarray]]) -> dict[str, Picture]:
-    """The two figures by the name of their file."""
-    shown = ["prototype", "tasks", "straight", "straight_noise", "curve", "random"]
-    trajectories = behaviour_trajectories(
-        {name.replace("_", " "): moved(played[name], "eef") for name in shown},
-        {name.replace("_", " "): played[name]["along"] for name in shown},
-    )
-    student, _ = load_student(Path(config.run_dir) / "distill" / "checkpoint.safetensors")
-    parts = [training_embeddings(config, student, task, 500) for task in config.tasks]
-    position = np.repeat([TASKS.index(task) for task in config.tasks], [len(x) for x in parts])
-    paths = {kind: make_paths(config, student, kind, 200) for kind in ("straight", "curve")}
-    drawn = embedding_paths(
-        np.concatenate(parts),
-        position,
-        paths,
-        embedding_points(config, student, "random")[0][:, 0],
-    )
-    return {
-        "interpolation_trajectories": Picture(
-            png=trajectories,
-            alt="Ways of the end-effector, one panel per method",
-            caption=(
-                "Ways of the end-effector from its start, seen from above and from behind; the "
-                "colour says where on its path between two tasks an episode's m lies."
-            ),
-        ),
-        "interpolation_paths": Picture(
-            png=drawn,
-            alt="Embeddings by task, with lines and curves between the tasks' prototypes",
-            caption=(
-                "Where the episodes' m lie: straight lines, curves over the training transitions, "
-                "and random points of the embedding."
-            ),
-        ),
-    }
 
 
 def interpolate(config: Config) -> None:
@@ -507,9 +328,16 @@ def interpolate(config: Config) -> None:
     played = {
         path.stem: read_episodes(path) for name in names for path in job_files((config, name))
     }
-    table = method_table(config, played)
+    student, _ = load_student(run_dir / "distill" / "checkpoint.safetensors")
+    pictures = make_pictures(
+        played,
+        {name: training_embeddings(config, student, name, 500) for name in config.tasks},
+        {kind: make_paths(config, student, kind, 200) for kind in ("straight", "curve")},
+        embedding_points(config, student, "random")[0][:, 0],
+    )
+    table = method_table(task, played)
     section = Section(heading="Interpolation as exploration", tables=[table])
-    write_study(run_dir, "interpolation", section, draw(config, played))
+    write_study(run_dir, "interpolation", section, pictures)
     print(table.markdown())
     if switching:
         ways = {name: read_episodes(folder(config) / f"{name}.csv") for name in SWITCHES}

@@ -310,6 +310,15 @@ def test_trailing_bytes_are_refused_by_name(saved: Path) -> None:
     refused(saved, "not a whole checkpoint")
 
 
+def test_a_checkpoint_without_a_checksum_is_refused_by_what_is_missing(path: Path) -> None:
+    from safetensors.torch import save_file
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    header = {"checkpoint": json.dumps({"state": {}, "metadata": META})}
+    save_file({}, path, header)
+    refused(path, "'sha256' is missing")
+
+
 @pytest.mark.parametrize("bit", range(64))
 def test_a_flipped_bit_in_the_header_s_length_is_refused_by_name(saved: Path, bit: int) -> None:
     data = bytearray(saved.read_bytes())

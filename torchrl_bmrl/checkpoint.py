@@ -195,8 +195,9 @@ def _read(path: Path) -> tuple[State, Metadata]:
         TypeError,
         ValueError,
     ) as error:
+        reason = f"{error} is missing" if isinstance(error, KeyError) else error
         raise CheckpointError(
-            path, f"not a whole checkpoint of this library in safetensors format ({error})"
+            path, f"not a whole checkpoint of this library in safetensors format ({reason})"
         ) from error
 
 
