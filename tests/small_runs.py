@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -34,6 +35,15 @@ Run = Callable[..., Path]
 def configured(*overrides: str) -> DictConfig:
     with initialize_config_dir(version_base="1.3", config_dir=str(RECIPES / "config")):
         return compose("recipe", overrides=list(overrides))
+
+
+def short_episodes(folder: Path) -> str:
+    """``PYTHONPATH`` of other processes, so that their episodes have ten steps, too."""
+    folder.mkdir()
+    (folder / "sitecustomize.py").write_text(
+        f"import torchrl_bmrl.names\ntorchrl_bmrl.names.HORIZON = {HORIZON}\n"
+    )
+    return os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")]))
 
 
 def contents(folder: Path, *patterns: str) -> dict[str, bytes]:
