@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import sys
 from collections.abc import Callable
@@ -407,6 +408,7 @@ def run_recipe(
                 f"{run_dir}: {run.__name__}, preset {config.preset}, seed {config.seed}, "
                 f"{config.workers} workers, {config.device}",
             )
+            gc.freeze()  # imported modules stay; robosuite would search them at every env.close()
             run(config)
 
 

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+
+def pytest_collection_finish() -> None:
+    """What was imported stays; robosuite would search all of it whenever an environment closes."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import runpy
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
@@ -35,6 +38,18 @@ Run = Callable[..., Path]
 def configured(*overrides: str) -> DictConfig:
     with initialize_config_dir(version_base="1.3", config_dir=str(RECIPES / "config")):
         return compose("recipe", overrides=list(overrides))
+
+
+def command_line(recipe: str, *overrides: str) -> int:
+    """Runs a recipe's command line as a person would, in this process; its exit code."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(RECIPES))
+        patch.setattr(sys, "argv", [f"{recipe}.py", *overrides])
+        try:
+            runpy.run_path(str(RECIPES / f"{recipe}.py"), run_name="__main__")
+        except SystemExit as end:
+            return int(end.code or 0)
+    return 0
 
 
 def short_episodes(folder: Path) -> str:

@@ -19,8 +19,8 @@ pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 pytest.importorskip("robosuite", exc_type=ImportError)
 
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+from small_runs import HORIZON, RECIPES, configured
 from tensordict import TensorDict
 
 from torchrl_bmrl import names
@@ -31,8 +31,6 @@ from torchrl_bmrl.parallel import derive_seed
 
 pytestmark = pytest.mark.robosuite
 
-RECIPES = Path(__file__).parents[1] / "recipes"
-HORIZON = 10
 ALGORITHMS = ["bc", "td3_bc", "iql", "cql", "bcq_one_hot"]
 TASKS = ["reach", "lift"]
 SMALL = [
@@ -65,8 +63,7 @@ def baselines() -> Iterator[Any]:
 
 
 def settings(folder: Path, *overrides: str) -> Any:
-    with initialize_config_dir(version_base="1.3", config_dir=str(RECIPES / "config")):
-        return compose("recipe", overrides=[*SMALL, f"run_dir={folder}", *overrides])
+    return configured(*SMALL, f"run_dir={folder}", *overrides)
 
 
 def make_learner(baselines: Any, folder: Path, algorithm: str, *overrides: str) -> Any:

@@ -21,11 +21,10 @@ pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
 import yaml
-from hydra import compose, initialize_config_dir
+from small_runs import RECIPES, configured, contents
 
 from torchrl_bmrl.errors import ConfigError, StoppedError
 
-RECIPES = Path(__file__).parents[1] / "recipes"
 SMALL = [
     "preset=smoke",
     "tasks=[reach,lift,push_up]",
@@ -50,11 +49,6 @@ def sweep(name: str, *overrides: str, cwd: Path) -> subprocess.CompletedProcess[
     )
 
 
-def contents(folder: Path, pattern: str) -> dict[str, bytes]:
-    files = sorted(folder.glob(pattern))
-    return {str(path.relative_to(folder)): path.read_bytes() for path in files if path.is_file()}
-
-
 @pytest.fixture(scope="module")
 def beside() -> Iterator[None]:
     """The recipes' modules, importable as they are for a script beside them."""
@@ -70,8 +64,7 @@ def run(beside: None) -> Callable[..., Path]:
     import settings
 
     def run(folder: Path, function: Any, *overrides: str, **options: Any) -> Path:
-        with initialize_config_dir(version_base="1.3", config_dir=str(RECIPES / "config")):
-            config = compose("recipe", overrides=[*overrides, f"run_dir={folder}", "workers=1"])
+        config = configured(*overrides, f"run_dir={folder}", "workers=1")
         settings.run_recipe(config, function, **options)
         return folder
 

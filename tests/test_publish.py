@@ -5,10 +5,7 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import shlex
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +21,7 @@ import yaml
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from published_data import make_rows
+from small_runs import RECIPES, command_line
 
 from torchrl_bmrl.checkpoint import save_checkpoint
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
@@ -31,8 +29,6 @@ from torchrl_bmrl.evaluation import ResultRow, write_results
 from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports.published import read_published
-
-RECIPES = Path(__file__).parents[1] / "recipes"
 
 
 @pytest.fixture
@@ -185,28 +181,25 @@ def test_episodes_of_another_seed_are_refused(publish: Any, tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_the_check_exits_with_one_line_when_a_number_was_changed(tmp_path: Path) -> None:
+def test_the_check_exits_with_one_line_when_a_number_was_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
     docs = tmp_path / "docs"
     with initialize_config_dir(str(RECIPES / "config"), version_base="1.3"):
         run_dir = make_folder(tmp_path / "run", "preset=quick")
 
-    def recipe(*overrides: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, str(RECIPES / "publish.py"), *overrides, f"docs={docs}"],
-            cwd=tmp_path,
-            env=os.environ,
-            capture_output=True,
-            text=True,
-            timeout=600,
-        )
+    def recipe(*overrides: str) -> int:
+        return command_line("publish", *overrides, f"docs={docs}")
 
-    assert recipe(f"runs=[{run_dir}]").returncode == 0
-    assert recipe("check=true").returncode == 0
+    assert recipe(f"runs=[{run_dir}]") == 0
+    assert recipe("check=true") == 0
     path = docs / "results" / "runs.csv"
     with path.open(newline="") as file:
         (row,) = csv.DictReader(file)
     write_rows(path, [row | {"seconds_collect": "999.0"}])
-    result = recipe("check=true")
-    assert result.returncode == 1
-    assert len(result.stderr.splitlines()) == 1
-    assert result.stderr.startswith(f"error: {docs / 'results.md'}: line ")
+    capsys.readouterr()
+    assert recipe("check=true") == 1
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1
+    assert said.startswith(f"error: {docs / 'results.md'}: line ")

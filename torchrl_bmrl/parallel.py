@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import multiprocessing
 import os
@@ -163,6 +164,7 @@ def _serve(connection: Connection, function: Callable[[Job, Report], Result]) ->
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's
     signal.signal(signal.SIGTERM, note_signal)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    gc.freeze()  # imported modules stay; robosuite would search them at every env.close()
 
     def report(units: int) -> None:
         connection.send(("report", units))
