@@ -355,7 +355,7 @@ def setting_names() -> list[str]:
 
 
 @pytest.mark.usefixtures("recipes")
-@settings(TRIED, max_examples=60)  # each one composes a configuration
+@settings(TRIED, max_examples=150)
 @given(data=st.data())
 def test_any_setting_is_refused_by_name_or_makes_losses(
     tmp_path: Path, data: st.DataObject

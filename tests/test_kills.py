@@ -1,7 +1,7 @@
 """Whole runs killed at random moments, and started again.
 
-One of the smallest run; with ``BMRL_KILLS=50`` in the environment fifty of preset smoke, by two
-workers, which take more than an hour.
+One of the smallest run; with ``BMRL_KILLS=50`` in the environment fifty of preset smoke, which
+take more than an hour.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ EQUAL = (
 
 
 def start(folder: Path) -> subprocess.Popen[bytes]:
-    settings = ["preset=smoke", "workers=2"] if KILLS else [*SMALL, "workers=1"]
-    command = [sys.executable, str(RECIPES / "two_stage.py"), *settings, f"run_dir={folder}"]
+    settings = [*(["preset=smoke"] if KILLS else SMALL), "workers=2", f"run_dir={folder}"]
+    command = [sys.executable, str(RECIPES / "two_stage.py"), *settings]
     with (folder.parent / f"{folder.name}.log").open("ab") as log:
         return subprocess.Popen(command, stdout=log, stderr=log, cwd=folder.parent)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import pickle
@@ -59,6 +60,15 @@ def test_two_workers_give_the_results_of_one_in_the_jobs_order(
     assert {result["threads"] for result in two} == {1}
     assert one == two
     assert "OMP_NUM_THREADS" not in os.environ
+
+
+def count_left_alone(job: int, report: Report) -> int:
+    return gc.get_freeze_count()
+
+
+@pytest.mark.slow
+def test_workers_do_not_search_what_was_imported_whenever_an_environment_closes() -> None:
+    assert min(run_jobs(count_left_alone, [0, 1], workers=2, **OPTIONS)) > 100_000
 
 
 def die_until(job: tuple[str, Path, int], report: Report) -> str:

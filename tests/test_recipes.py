@@ -297,8 +297,8 @@ def show_results(folder: Path) -> dict[str, bytes]:
 def test_two_stages_from_an_empty_folder_to_the_report_and_again(tmp_path: Path) -> None:
     pytest.importorskip("robosuite", exc_type=ImportError)
     pytest.importorskip("matplotlib")
-    overrides = [*SMALL, "bcq.epochs=1", "evaluate.latent_sources=[online]", "run_dir=run"]
-    overrides += ["workers=1"]
+    overrides = [*SMALL, "bcq.epochs=1", "evaluate.latent_sources=[online]"]
+    overrides += ["run_dir=run", "workers=1"]
     done = recipe("two_stage", *overrides, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "report: run/report.html" in done.stdout
