@@ -40,7 +40,7 @@ from small_runs import (
 )
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.evaluation import RESULT_FIELDS, read_results
+from torchrl_bmrl.evaluation import RESULT_FIELDS, read_results, write_results
 
 
 def recipe(name: str, *overrides: str, cwd: Path, **env: str) -> subprocess.CompletedProcess[str]:
@@ -217,6 +217,26 @@ def test_what_was_imported_is_not_searched_whenever_an_environment_closes(
         lambda config: left_alone.append(gc.get_freeze_count()),
     )
     assert left_alone[0] > 100_000
+
+
+def test_an_episode_has_the_length_of_now_whenever_a_recipe_was_imported(
+    recipes: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    pytest.importorskip("matplotlib")
+    import evaluate
+    import interpolate
+
+    from torchrl_bmrl import names
+
+    config = OmegaConf.to_object(configured(*SMALL, f"run_dir={tmp_path}"))
+    (tmp_path / "evaluation").mkdir()
+    write_results(tmp_path / "evaluation" / "lift-bcq.csv", [])
+    monkeypatch.setattr(names, "HORIZON", 7)
+    assert interpolate.job_size((config, "prototype")) == 7 * config.interpolation.episodes
+    reported: list[int] = []
+    evaluate.keep_rows(config, "lift", "bcq", lambda _: [], report=reported.append)
+    assert reported == [7 * config.evaluate.episodes]
 
 
 @pytest.mark.parametrize("preset", ["smoke", "quick", "paper", "literal", "compose"])
