@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import runpy
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -40,8 +41,20 @@ def configured(*overrides: str) -> DictConfig:
         return compose("recipe", overrides=list(overrides))
 
 
+def recipe(name: str, *overrides: str, cwd: Path, **env: str) -> subprocess.CompletedProcess[str]:
+    """Runs a recipe's command line as a person would."""
+    return subprocess.run(
+        [sys.executable, str(RECIPES / f"{name}.py"), *overrides],
+        cwd=cwd,
+        env={**os.environ, **env},
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+
+
 def command_line(recipe: str, *overrides: str) -> int:
-    """Runs a recipe's command line as a person would, in this process; its exit code."""
+    """The same in this process; its exit code."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(RECIPES))
         patch.setattr(sys, "argv", [f"{recipe}.py", *overrides])

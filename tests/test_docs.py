@@ -129,7 +129,7 @@ def test_every_command_of_a_recipe_gives_settings_that_it_takes(
     monkeypatch.syspath_prepend(str(ROOT / "recipes"))
     recipe = Path(words[1]).stem
     module = importlib.import_module(recipe)
-    # test_recipes.py reads the help, test_multirun.py runs the launchers.
+    # test_command_line.py reads the help, test_multirun.py runs the launchers.
     options = [word for word in words[2:] if not word.startswith(("--help", "hydra/", "hydra."))]
     if "--multirun" in options:
         options.remove("--multirun")

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +15,10 @@ pytest.importorskip("mujoco")
 pytest.importorskip("safetensors")
 pytest.importorskip("tqdm")
 
-from small_runs import command_line
+from small_runs import RECIPES, command_line, recipe
 
 from torchrl_bmrl.errors import BMRLError
 
-RECIPE = Path(__file__).parents[1] / "recipes" / "extrapolation.py"
 ALGORITHMS = ["ddpg", "bc", "td3_bc", "iql", "plas", "bcq"]
 SMALL = [
     "env=InvertedPendulum-v5",
@@ -37,23 +33,11 @@ SMALL = [
 ]
 
 
-def recipe(*overrides: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Runs the recipe as a person would."""
-    return subprocess.run(
-        [sys.executable, str(RECIPE), *overrides],
-        cwd=cwd,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-
-
 @pytest.fixture(scope="module")
 def extrapolation() -> Any:
     """The recipe's module, importable as it is for a script beside it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(RECIPE.parent))
+        patch.syspath_prepend(str(RECIPES))
         import extrapolation
 
         yield extrapolation
@@ -128,7 +112,7 @@ def test_an_error_is_one_line_and_leaves_nothing(
 def test_every_algorithm_runs_on_every_batch_and_a_repeated_command_redoes_nothing(
     tmp_path: Path,
 ) -> None:
-    done = recipe(*SMALL, "run_dir=run", cwd=tmp_path)
+    done = recipe("extrapolation", *SMALL, "run_dir=run", cwd=tmp_path, OMP_NUM_THREADS="1")
     assert done.returncode == 0, done.stderr
     run = tmp_path / "run"
     with (run / "results.csv").open(newline="") as file:
@@ -148,7 +132,7 @@ def test_every_algorithm_runs_on_every_batch_and_a_repeated_command_redoes_nothi
     before = (run / "results.csv").read_bytes()
     (run / "results" / "bc-seed5.csv").unlink()
     del written[run / "results" / "bc-seed5.csv"]
-    again = recipe(*SMALL, "run_dir=run", cwd=tmp_path)
+    again = recipe("extrapolation", *SMALL, "run_dir=run", cwd=tmp_path, OMP_NUM_THREADS="1")
     assert again.returncode == 0, again.stderr
     assert {path: path.stat().st_mtime_ns for path in written} == written
     assert (run / "results.csv").read_bytes() == before  # the missing one came out the same

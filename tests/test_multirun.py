@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import shutil
 import signal
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,7 +19,7 @@ pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
 import yaml
-from small_runs import RECIPES, configured, contents
+from small_runs import RECIPES, configured, contents, recipe
 
 from torchrl_bmrl.errors import ConfigError, StoppedError
 
@@ -36,17 +34,6 @@ SMALL = [
     "evaluate.num_candidates=5",
 ]
 REACH = ["preset=smoke", "tasks=[reach]", "collect.train_episodes.reach=1", "workers=1"]
-
-
-def sweep(name: str, *overrides: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Sweeps a recipe as a person would."""
-    return subprocess.run(
-        [sys.executable, str(RECIPES / f"{name}.py"), "--multirun", *overrides],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +145,7 @@ def check_sweep_of_three_seeds(cwd: Path, alone: list[dict[str, bytes]], *launch
     taken = cwd / "runs" / "collect-smoke-seed1"
     taken.mkdir(parents=True)
     (taken / "config.yaml").write_text(yaml.safe_dump({"seed": 7}))
-    done = sweep("collect", *REACH, "seed=0,1,2", *launcher, cwd=cwd)
+    done = recipe("collect", "--multirun", *REACH, "seed=0,1,2", *launcher, cwd=cwd)
     assert done.returncode == 1
     _, message = done.stderr.split("1 of 3 jobs failed, the others are done:\n")
     names, problem = message.splitlines()
@@ -210,7 +197,7 @@ def test_agents_spread_over_jobs_are_those_of_one_run(run: Any, tmp_path: Path) 
     # Two agents in a job: its workers are processes of a process.
     options = ["run_dir=spread", "workers=2", "only=[reach,lift],[push_up]", "logger=none"]
     launcher = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
-    done = sweep("train_bcq", *SMALL, *options, *launcher, cwd=tmp_path)
+    done = recipe("train_bcq", "--multirun", *SMALL, *options, *launcher, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     expected = contents(one, "bcq/**/*")
     assert len(expected) == 9  # checkpoint, best networks and rollouts of each

@@ -1,0 +1,250 @@
+"""The recipes' command lines: errors, help, presets, ablations."""
+
+from __future__ import annotations
+
+import ast
+import gc
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("hydra")
+pytest.importorskip("gymnasium")
+pytest.importorskip("h5py")
+pytest.importorskip("safetensors")
+pytest.importorskip("scipy")
+pytest.importorskip("tqdm")
+
+from omegaconf import OmegaConf
+from small_runs import (
+    RECIPES,
+    SMALL,
+    command_line,
+    configured,
+    recipe,
+)
+
+from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.evaluation import write_results
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (["preset=smoke", "bcq.lrr=1"], ["bcq.lrr", "BCQSettings"]),
+        (["preset=smoke", "bcq.lr=abc"], ["bcq.lr", "'abc'", "Float"]),
+        (["preset=smoke", "tasks=[lfit]"], ["error: unknown task 'lfit'", "reach, lift, push_r"]),
+        (["preset=fast"], ["preset/fast", "compose", "literal", "paper", "quick", "smoke"]),
+        (["preset=smoke", "logger=log"], ["unknown logger 'log'", "csv, wandb, tensorboard, none"]),
+        (["preset=smoke", "distill.updates=-5"], ["error: distill.updates is -5", "above 0"]),
+    ],
+    ids=["unknown key", "wrong type", "unknown task", "unknown preset", "unknown logger", "range"],
+)
+def test_an_invalid_setting_is_named_and_nothing_is_written(
+    tmp_path: Path,
+    overrides: list[str],
+    says: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert command_line("train_bcq", *overrides) == 1
+    said = capsys.readouterr()
+    for part in says:
+        assert part in said.err
+    assert "Traceback" not in said.out + said.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_path: Path) -> None:
+    done = recipe(
+        "train_bcq", "preset=smoke", "tasks=[lift]", "workers=1", "run_dir=run", cwd=tmp_path
+    )
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1] == (
+        "error: run/data/statistics.json: no such file; recipes/collect.py writes it"
+    )
+    assert "Traceback" not in done.stderr
+    left = {path.name for path in (tmp_path / "run").iterdir()}
+    assert left == {"config.yaml", "versions.json", ".locks"}
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("tasks=[]", r"tasks is \[\]"),
+        ("tasks=[lift,lift]", "each once"),
+        ("only=[]", r"only is \[\]; valid: some of .'reach', 'lift'"),
+        ("only=[lift,lift]", "only is .'lift', 'lift'.; valid: .*each once"),
+        ("only=[lfit]", "only is .'lfit'.; valid: some of .'reach', 'lift'"),
+        ("+collect.train_episodes.lfit=1", "unknown task 'lfit'"),
+        ("collect.train_episodes.lift=0", "collect.train_episodes"),
+        ("collect.valid_episodes=0", "collect.valid_episodes"),
+        ("evaluate.latent_sources=[]", r"evaluate.latent_sources is \[\]"),
+        ("evaluate.latent_sources=[mean]", "'mean'; .*prototype, online, demonstration"),
+        ("distill.context=next", "distill.context 'next'; .*current, previous, random, set"),
+        ("distill.task_encoder=two_hot", "distill.task_encoder 'two_hot'; .*transition, one_hot"),
+        ("distill.task_encoder=one_hot", "task_encoder is one_hot.*isometry_weight=0"),
+        ("distill.prototype=mode", "distill.prototype 'mode'; .*mean, medoid"),
+        ("bcq.loss_function=l3", "bcq.loss_function 'l3'; .*l2, l1, smooth_l1"),
+        ("bcq.kl_reduction=max", "bcq.kl_reduction 'max'; .*mean, sum"),
+        ("bcq.lmbda=1.5", "bcq.lmbda is 1.5; valid: between 0 and 1"),
+        ("bcq.generator_warmup=-1", "bcq.generator_warmup is -1; valid: 0 or above"),
+        ("bcq.critic_grad_clip=0", "bcq.critic_grad_clip is 0.0; valid: above 0, or null"),
+        ("bcq.value_bounds=[1,0]", r"value_bounds are .1.0, 0.0.; valid: .*low < high"),
+        ("distill.encoder_terms=[critic]", "unknown encoder term 'critic'; .*qvalue, metric"),
+        ("distill.metric_weight=-1", "distill.metric_weight is -1.0; valid: 0 or above"),
+        ("distill.isometry_weight=-1", "distill.isometry_weight is -1.0; valid: 0 or above"),
+        ("workers=0", "workers is 0"),
+        ("bcq.lr=0", "bcq.lr is 0"),
+        ("bcq.seeds=0", "bcq.seeds is 0"),
+        (("only=[lift]", "bcq.stacked=true"), "only is .*; valid: null with bcq.stacked"),
+        ("bcq.target_dtype=float8", "bcq.target_dtype 'float8'; .*None, bfloat16"),
+        ("device=gpu", "device is 'gpu'; valid: one that torch can use"),
+        ("bcq.eval_episodes=0", "bcq.eval_episodes is 0"),
+        ("evaluate.episodes=-1", "evaluate.episodes is -1"),
+        ("interpolation.episodes=0", "interpolation.episodes is 0"),
+        ("interpolation.task=lfit", "unknown task 'lfit'"),
+        ("checkpoint_interval=0", "checkpoint_interval is 0"),
+        ("latent_sac.composition=reach-lfit", "unknown task 'lfit'"),
+        ("latent_sac.hold=0", "latent_sac.hold is 0"),
+        ("latent_sac.seeds=[1,1]", r"latent_sac.seeds is \[1, 1\]; valid: at least one, each once"),
+        ("latent_sac.random_steps=-1", "latent_sac.random_steps is -1; valid: 0 or above"),
+        ("baselines.algorithms=[ddpg]", "unknown baseline 'ddpg'; .*td3_bc, iql, cql, bcq_one_hot"),
+        ("baselines.algorithms=[bc,bc]", r"baselines.algorithms is .*; valid: .*each once"),
+        ("baselines.updates=0", "baselines.updates is 0; valid: above 0, or null"),
+    ],
+)
+def test_every_stage_is_checked_before_the_first_one_starts(
+    recipes: Any, tmp_path: Path, override: str | tuple[str, ...], says: str
+) -> None:
+    overrides = [override] if isinstance(override, str) else override
+    config = OmegaConf.to_object(configured("preset=smoke", f"run_dir={tmp_path}", *overrides))
+    with pytest.raises(BMRLError, match=says):
+        recipes.check_settings(config)
+
+
+@pytest.mark.parametrize(
+    "name", sorted(path.stem for path in RECIPES.glob("*.py") if "@hydra.main" in path.read_text())
+)
+def test_a_recipes_help_says_what_it_does_and_shows_how(name: str) -> None:
+    text = ast.get_docstring(ast.parse((RECIPES / f"{name}.py").read_text())) or ""
+    lines = text.splitlines()
+    assert lines[0].endswith((".", "?"))
+    assert any(line.strip().startswith(f"python recipes/{name}.py") for line in lines)
+    assert len(lines) <= 16  # the rest of the help has 21, a screen 40
+
+
+def test_help_is_one_screen_with_every_preset_and_ablation_and_leaves_nothing(
+    tmp_path: Path,
+) -> None:
+    done = recipe("two_stage", "--help", cwd=tmp_path)
+    lines = done.stdout.splitlines()
+    assert (done.returncode, done.stderr) == (0, "")
+    assert lines[0] == "The whole pipeline: demonstrations, stage 1, stage 2, evaluation, report."
+    assert len(lines) <= 40
+    assert max(map(len, lines)) <= 100
+    for group in ("preset", "ablation"):
+        names = {path.stem for path in (RECIPES / "config" / group).glob("*.yaml")} - {"none"}
+        assert names <= set(re.findall(r"\w+", done.stdout)), group
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_was_imported_is_not_searched_whenever_an_environment_closes(
+    recipes: Any, tmp_path: Path
+) -> None:
+    left_alone: list[int] = []
+    gc.unfreeze()
+    recipes.run_recipe(
+        configured("preset=smoke", f"run_dir={tmp_path}"),
+        lambda config: left_alone.append(gc.get_freeze_count()),
+    )
+    assert left_alone[0] > 100_000
+
+
+def test_an_episode_has_the_length_of_now_whenever_a_recipe_was_imported(
+    recipes: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    pytest.importorskip("matplotlib")
+    import evaluate
+    import interpolate
+
+    from torchrl_bmrl import names
+
+    config = OmegaConf.to_object(configured(*SMALL, f"run_dir={tmp_path}"))
+    (tmp_path / "evaluation").mkdir()
+    write_results(tmp_path / "evaluation" / "lift-bcq.csv", [])
+    monkeypatch.setattr(names, "HORIZON", 7)
+    assert interpolate.job_size((config, "prototype")) == 7 * config.interpolation.episodes
+    reported: list[int] = []
+    evaluate.keep_rows(config, "lift", "bcq", lambda _: [], report=reported.append)
+    assert reported == [7 * config.evaluate.episodes]
+
+
+@pytest.mark.parametrize("preset", ["smoke", "quick", "paper", "literal", "compose"])
+def test_every_preset_is_complete_and_valid(recipes: Any, tmp_path: Path, preset: str) -> None:
+    config = OmegaConf.to_object(configured(f"preset={preset}", f"run_dir={tmp_path}"))
+    recipes.check_settings(config)
+    assert config.tasks == ["reach", "lift", "push_right", "push_left", "push_up", "push_down"]
+
+
+def test_the_presets_differ_in_what_their_names_say(recipes: Any, tmp_path: Path) -> None:
+    paper, literal, quick = (
+        OmegaConf.to_object(configured(f"preset={preset}", f"run_dir={tmp_path}"))
+        for preset in ("paper", "literal", "quick")
+    )
+    assert list(paper.collect.train_episodes.values()) == [500, 500, 100, 100, 100, 100]
+    assert literal.distill.context_fraction == literal.distill.latent_norm_weight == 0.0
+    assert literal.distill.encoder_terms == ["classification"]
+    assert literal.bcq == quick.bcq
+    assert configured(f"run_dir={tmp_path}") == configured("preset=quick", f"run_dir={tmp_path}")
+
+
+ABLATIONS = sorted(path.stem for path in (RECIPES / "config" / "ablation").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("ablation", ABLATIONS)
+@pytest.mark.parametrize("preset", ["quick", "paper"])
+def test_an_ablation_is_valid_and_changes_one_group_of_settings_of_any_preset(
+    recipes: Any, tmp_path: Path, preset: str, ablation: str
+) -> None:
+    plain, config = (
+        OmegaConf.to_object(
+            configured(f"preset={preset}", f"ablation={name}", f"run_dir={tmp_path}")
+        )
+        for name in ("none", ablation)
+    )
+    recipes.check_settings(config)
+    assert (config.preset, config.ablation) == (preset, ablation)
+    groups = [group for group, value in vars(plain).items() if value != getattr(config, group)]
+    if ablation == "none":
+        assert not groups
+    elif (preset, ablation) == ("paper", "demos_all"):  # what it has anyway
+        assert groups == ["ablation"]
+    elif ablation == "one_hot":  # acts on a point alone, where the paper preset has three sources
+        assert {"ablation", "distill"} <= set(groups) <= {"ablation", "distill", "evaluate"}
+    else:
+        assert len(groups) == 2
+
+
+def test_what_each_ablation_takes_away_is_away(recipes: Any, tmp_path: Path) -> None:
+    def ablated(name: str) -> Any:
+        return OmegaConf.to_object(configured(f"ablation={name}", f"run_dir={tmp_path}"))
+
+    assert ablated("no_direction").distill.direction_weight == 0
+    assert ablated("no_isometry").distill.isometry_weight == 0
+    assert ablated("detached").distill.encoder_terms == ["classification"]
+    assert [ablated(f"dim{n}").distill.task_latent_dim for n in (4, 8)] == [4, 8]
+    assert ablated("one_hot").distill.task_encoder == "one_hot"
+    assert ablated("perturbation").bcq.perturbation
+    assert ablated("latent_clip_none").bcq.latent_clip is None
+    assert ablated("candidates_2").bcq.num_candidates == 2
+    assert [ablated(f"acting_{n}").evaluate.num_candidates for n in (1, 10)] == [1, 10]
+    assert [ablated(f"noise_{n}").collect.noise for n in (0, 40)] == [0.0, 0.4]
+    for n in (10, 50, 100):
+        assert set(ablated(f"demos_{n}").collect.train_episodes.values()) == {n}
+    paper = OmegaConf.to_object(configured("preset=paper", f"run_dir={tmp_path}"))
+    assert ablated("demos_all").collect == paper.collect
