@@ -122,10 +122,10 @@ def plas(*dims: int, cells: Cells = CELLS) -> Algorithm:
     # Published: 2. BCQ's 0.5 keeps to latents that so short a training has seen.
     actor = make_latent_actor(dims[0], generator.latent_dim, num_cells=cells, max_latent=0.5)
     loss = PLASLoss(generator, actor, make_critics(*dims, cells), bounds=BOUNDS)
-    return loss, lambda: PLASPolicy.from_loss(loss)
+    return loss, lambda: PLASPolicy.frozen(loss)
 
 
 def bcq(*dims: int, cells: Cells = CELLS) -> Algorithm:
     """The best of what a generator of the batch's actions proposes."""
     loss = BCQLoss(ActionVAE(*dims, num_cells=cells), make_critics(*dims, cells), bounds=BOUNDS)
-    return loss, lambda: BCQPolicy.from_loss(loss)
+    return loss, lambda: BCQPolicy.frozen(loss)

@@ -126,11 +126,10 @@ class Agents:
         """Some of an agent's candidates, ``(states, candidates, action_dim)``."""
         loss = self.agent(name)
         states = batch[:32].select(*loss.observation_keys)
-        states = states.unsqueeze(-1).expand(len(states), 10)
         device = torch.device(self.config.device)
         # Training draws the same random numbers whether or not it is looked at.
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
-            return loss.propose(states, loss.latent_clip)["action"]
+            return loss.propose(states, 10)["action"]
 
     def load(self) -> None:
         """Goes on from what was kept, if anything was."""

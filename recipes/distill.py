@@ -94,7 +94,7 @@ def train_student(config: Config, report: Report) -> None:
 
     torch.manual_seed(derive_seed(config.seed, "distill"))
     losses = load_teachers(config)
-    teachers = [BCQPolicy.from_loss(loss) for loss in losses]
+    teachers = [BCQPolicy.frozen(loss) for loss in losses]
     options = {
         "num_tasks": len(config.tasks),
         "task_encoder": settings.task_encoder,

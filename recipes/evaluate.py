@@ -140,7 +140,7 @@ def evaluate_job(job: tuple[Config, str, str, str], report: Report) -> list[Resu
             return played
         if policy_name == "bcq":
             loss, _ = load_bcq_loss(run_dir / "bcq" / task / "checkpoint.safetensors")
-            policy = BCQPolicy.from_loss(loss, num_candidates=count)
+            policy = BCQPolicy.frozen(loss, num_candidates=count)
             statistics = read_statistics(run_dir / "data")
             return play(config, task, policy, statistics=statistics, seeds=seeds, report=report)
         student, metadata = load_student(student_path(config))

@@ -72,7 +72,7 @@ def evaluate_job(job: Job, report: Report) -> list[dict]:
         count = config.evaluate.episodes
         starts = [derive_seed(config.seed, "evaluate", TASK, i) for i in range(count)]
         loss, _ = load_bcq_loss(folder / "checkpoint.safetensors")
-        policy = BCQPolicy.from_loss(loss, num_candidates=config.evaluate.num_candidates)
+        policy = BCQPolicy.frozen(loss, num_candidates=config.evaluate.num_candidates)
         statistics = read_statistics(Path(config.run_dir) / "data")
         env = make_env(TASK, statistics, num_envs=count, stepper=config.stepper)
         with closing(env):

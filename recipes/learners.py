@@ -143,7 +143,7 @@ class Learner:
             size = OBSERVATION_DIM + len(self.config.tasks)
             loss = make_bcq_loss(observation_dim=size, **options)
             count = self.config.evaluate.num_candidates
-            return loss, lambda: BCQPolicy.from_loss(loss, num_candidates=count)
+            return loss, lambda: BCQPolicy.frozen(loss, num_candidates=count)
         build = BUILDERS[self.algorithm]
         loss, make_policy = build(OBSERVATION_DIM, ACTION_DIM, cells=settings.num_cells)
         if self.algorithm != "bc":

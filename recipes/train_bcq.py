@@ -176,7 +176,7 @@ def evaluate_epoch(config, task, loss, statistics, epoch, update) -> list[dict]:
     """Rollouts after an epoch, on the same starts every time, for the curves."""
     count = config.bcq.eval_episodes
     seeds = [derive_seed(config.seed, "curve", task, i) for i in range(count)]
-    policy = BCQPolicy.from_loss(loss, num_candidates=config.evaluate.num_candidates).to("cpu")
+    policy = BCQPolicy.frozen(loss, num_candidates=config.evaluate.num_candidates).to("cpu")
     env = make_env(task, statistics, num_envs=count, stepper=config.stepper)
     with closing(env):
         outcomes = evaluate_policy(env, policy, seeds)

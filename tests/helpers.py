@@ -104,6 +104,11 @@ def unchanged(module: TensorDictModule) -> TensorDictModule:
     return module
 
 
+def undeclared(module: TensorDictModule) -> TensorDictModule:
+    """The network as a user writes it: it says neither its sizes nor its bounds."""
+    return TensorDictModule(module.module, module.in_keys, module.out_keys)
+
+
 class OnTorso(nn.Module):
     """A network that reads features of the observation; it has a parameter of its own, too."""
 

@@ -118,11 +118,12 @@ def perturbed(
     max_perturbation: float,
     bounds: tuple[ndarray, ndarray],
 ) -> ndarray:
-    """a + φ ξ(s, a) within the bounds; a itself where there is no such network."""
+    """a + φ h ξ(s, a) within the bounds, h half their distance; a itself without a network."""
     if f"{name}.output.bias" not in state:
         return action
     xi = np.tanh(network(state, name, observation, action))
-    return np.minimum(np.maximum(action + max_perturbation * xi, bounds[0]), bounds[1])
+    moved = action + max_perturbation * (bounds[1] - bounds[0]) / 2 * xi
+    return np.minimum(np.maximum(moved, bounds[0]), bounds[1])
 
 
 def train_autoencoder(

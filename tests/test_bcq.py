@@ -21,6 +21,7 @@ from helpers import (
     recorded,
     run,
     transitions,
+    undeclared,
 )
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
@@ -43,7 +44,7 @@ def expected_next_value(loss: BCQLoss, latent: Tensor, data: TensorDict) -> np.n
     action = numpy_decoder(loss.generator_params["decoder"], observation, latent)
     if loss.perturbation_network is not None:
         network = loss.target_perturbation_network_params["module", "network"]
-        moved = action + 0.4 * np.tanh(numpy_mlp(network, observation, action))
+        moved = action + 0.4 * 0.25 * np.tanh(numpy_mlp(network, observation, action))
         action = np.clip(moved, -0.25, 0.25)
     targets = loss.target_qvalue_network_params["module"]
     q = np.stack([numpy_mlp(targets[j], observation, action)[..., 0] for j in (0, 1)])
@@ -56,7 +57,9 @@ def expected_next_value(loss: BCQLoss, latent: Tensor, data: TensorDict) -> np.n
 @pytest.mark.parametrize("perturbation", [False, True])
 @pytest.mark.parametrize("batch", [(8,), (2, 4)])
 def test_qvalue_loss_is_that_of_the_equations(perturbation: bool, batch: tuple[int, ...]) -> None:
+    # A decoder of the user's may reach beyond the bounds, which then clip what is perturbed.
     options = {"max_perturbation": 0.4, "bounds": (-0.25, 0.25)} if perturbation else {}
+    options |= {"edit": undeclared}
     loss = make_bcq_loss(
         perturbation=perturbation, num_candidates=CANDIDATES, gamma=GAMMA, lmbda=LMBDA, **options
     )
@@ -120,6 +123,7 @@ def test_candidates_of_the_target_are_perturbed_in_every_dimension_within_the_bo
         deactivate_vmap=True,
         max_perturbation=0.4,
         bounds=(torch.tensor([-0.3, -0.2]), torch.tensor([0.1, 0.2])),
+        edit=undeclared,
     )
     proposed = recorded(loss.generator.decoder.module)
     perturbations = recorded(loss.perturbation_network.module)
@@ -129,7 +133,7 @@ def test_candidates_of_the_target_are_perturbed_in_every_dimension_within_the_bo
     seen = judged[0][0][1]
     assert perturbation.shape == seen.shape == (8, 10, ACTION_DIM)
     assert (perturbation[..., 0] != perturbation[..., 1]).all()
-    moved = action + 0.4 * perturbation
+    moved = action + 0.4 * (0.5 * (loss.action_high - loss.action_low)) * perturbation
     assert torch.equal(seen, moved.clamp(loss.action_low, loss.action_high))
     assert (seen != moved).any()
     assert (seen != action).any(0).all()
@@ -234,15 +238,17 @@ def test_the_sum_of_the_divergence_is_its_mean_times_the_size_of_the_latent() ->
 
 
 def test_perturbation_loss_is_minus_the_first_critic_at_the_perturbed_proposal() -> None:
-    loss = make_bcq_loss(perturbation=True, max_perturbation=0.4, bounds=(-0.25, 0.25))
+    options = {"max_perturbation": 0.4, "bounds": (-0.25, 0.25), "edit": undeclared}
+    loss = make_bcq_loss(perturbation=True, **options)
     data = transitions(8)
     calls = recorded(loss.generator.decoder.module)
     value, _ = loss.perturbation_loss(data)
-    (observation, latent), _ = calls[0]
+    observation, latent = (value.squeeze(-2) for value in calls[0][0])
     assert torch.equal(observation, data["observation"])
     action = numpy_decoder(loss.generator_params["decoder"], observation, latent)
     network = loss.perturbation_network_params["module", "network"]
-    action = np.clip(action + 0.4 * np.tanh(numpy_mlp(network, observation, action)), -0.25, 0.25)
+    moved = action + 0.4 * 0.25 * np.tanh(numpy_mlp(network, observation, action))
+    action = np.clip(moved, -0.25, 0.25)
     q = numpy_mlp(loss.qvalue_network_params["module"][0], observation, action)
     np.testing.assert_allclose(value.item(), -q.mean(), rtol=1e-10)
 
@@ -268,7 +274,7 @@ SPEC = Bounded(low=torch.tensor([-1.0, -2.0]), high=torch.tensor([0.5, 3.0]), sh
 
 @pytest.mark.parametrize("spec", [SPEC, Composite(action=SPEC)])
 def test_bounds_may_come_from_the_action_spec(spec: Any) -> None:
-    loss = make_bcq_loss(bounds=None, action_spec=spec)
+    loss = make_bcq_loss(bounds=None, action_spec=spec, edit=undeclared)
     assert loss.action_low.tolist() == [-1.0, -2.0]
     assert loss.action_high.tolist() == [0.5, 3.0]
     assert {"action_low", "action_high"} <= loss.state_dict().keys()

@@ -160,7 +160,7 @@ def test_a_trained_loss_comes_back_from_its_file_alone(path: Path, perturbation:
     assert not any(parameter.requires_grad for parameter in again.parameters())
     actions = []
     for module in (loss, again):
-        policy = BCQPolicy.from_loss(module)
+        policy = BCQPolicy.frozen(module)
         torch.manual_seed(0)
         actions.append(policy(TensorDict({"observation": torch.zeros(4, 3)}, [4]))["action"])
     assert torch.equal(*actions)

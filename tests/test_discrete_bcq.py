@@ -161,7 +161,7 @@ def test_the_policy_of_a_loss_takes_the_best_likely_action_and_is_a_copy(
     loss = make_discrete_bcq_loss(
         action_space=action_space, num_critics=number, threshold=0.7, reduction="none"
     )
-    policy = DiscreteBCQPolicy.from_loss(loss)
+    policy = DiscreteBCQPolicy.frozen(loss)
     data = discrete_transitions(64, action_space=action_space)
 
     def act() -> np.ndarray:

@@ -22,6 +22,7 @@ from helpers import (
     run,
     task_transitions,
     total,
+    undeclared,
 )
 from tensordict import TensorDict, TensorDictParams
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -389,7 +390,7 @@ def test_teachers_of_different_widths_teach_as_equally_wide_ones() -> None:
 @pytest.mark.filterwarnings(NO_UPDATER)
 def test_decoders_and_critics_of_plas_are_teachers() -> None:
     experts = [make_plas_loss(seed=seed) for seed in range(TASKS)]
-    decoders = [PLASPolicy.from_loss(expert).decoder for expert in experts]
+    decoders = [PLASPolicy.frozen(expert).decoder for expert in experts]
     critics = []
     for expert in experts:
         critic, params = expert.critic(0)
@@ -442,7 +443,8 @@ def test_previous_context_embeds_the_previous_transition_on_the_chosen_share(
 
 def identity_loss(context: str, **options: Any) -> MetaDistillationLoss:
     """Its encoder returns the observation, so that an embedding tells which rows it is made of."""
-    _, classifier, generator, critic = make_student_networks(TASKS, torch.float64)
+    networks = map(undeclared, make_student_networks(TASKS, torch.float64))
+    _, classifier, generator, critic = networks
     encoder = TensorDictModule(
         lambda observation: observation, in_keys=["observation"], out_keys=["task_latent"]
     )
@@ -451,7 +453,7 @@ def identity_loss(context: str, **options: Any) -> MetaDistillationLoss:
         classifier,
         generator,
         critic,
-        *make_teachers(TASKS),
+        *([undeclared(x) for x in teachers] for teachers in make_teachers(TASKS)),
         latent_dim=LATENT_DIM,
         context=context,
         context_fraction=1.0,
@@ -513,13 +515,20 @@ def test_as_many_generators_as_critics_are_needed() -> None:
 
 
 def test_a_teacher_of_another_action_is_refused_and_not_broadcast() -> None:
-    loss = MetaDistillationLoss(
-        *make_student_networks(TASKS, torch.float64),
+    networks = [
+        make_student_networks(TASKS, torch.float64),
         [make_decoder(3, 1, LATENT_DIM).double() for _ in range(TASKS)],
         [make_qvalue_network(3, 1).double() for _ in range(TASKS)],
-        latent_dim=LATENT_DIM,
-        context="current",
-    )
+    ]
+
+    def build(students: Any, generators: Any, critics: Any) -> MetaDistillationLoss:
+        options = {"latent_dim": LATENT_DIM, "context": "current"}
+        return MetaDistillationLoss(*students, generators, critics, **options)
+
+    with pytest.raises(BMRLError, match=r"'action' has the size 2 in .* and 1 in a teacher"):
+        build(*networks)
+    # Networks that do not say their sizes are found at the first batch.
+    loss = build(*([undeclared(x) for x in part] for part in networks))
     with pytest.raises(BMRLError, match=r"'action' has the shape \(3, 5, 1\); valid: \(3, 5, 2\)"):
         loss(task_transitions(TASKS, ROWS))
 

@@ -64,7 +64,8 @@ def test_perturbed_action_is_moved_by_phi_and_clipped_per_dimension(
 ) -> None:
     action, perturbation = rng.uniform(-1, 1, (2, 50, 3))
     low, high = np.array([-0.5, -1.0, -0.2]), np.array([0.5, 1.0, 0.9])
-    expected = np.minimum(np.maximum(action + 0.3 * perturbation, low), high)
+    moved = action + 0.3 * (high - low) / 2 * perturbation
+    expected = np.minimum(np.maximum(moved, low), high)
     assert (expected == low).any()
     assert (expected == high).any()
     result = functional.perturbed_action(

@@ -387,6 +387,6 @@ def test_any_setting_is_refused_by_name_or_makes_losses(
     )
     make_distillation_loss(
         student,
-        [BCQPolicy.from_loss(agent) for agent in agents],
+        [BCQPolicy.frozen(agent) for agent in agents],
         **{name: getattr(config.distill, name) for name in DISTILLATION},
     )

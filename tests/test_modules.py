@@ -19,6 +19,7 @@ from helpers import (
     numpy_mlp,
     recorded,
     transitions,
+    undeclared,
 )
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
@@ -220,7 +221,7 @@ def test_policy_perturbs_the_candidates_within_the_bounds_before_it_judges_them(
     low, high = torch.tensor([-0.1, -0.2]), torch.tensor([0.3, 0.05])
     critic = near(0.2)
     policy = BCQPolicy(
-        generator.decoder,
+        undeclared(generator.decoder),
         critic,
         perturbation,
         latent_dim=LATENT_DIM,
@@ -229,7 +230,8 @@ def test_policy_perturbs_the_candidates_within_the_bounds_before_it_judges_them(
     )
     proposed, judged = recorded(generator.decoder.module), recorded(critic.module)
     action = policy(observations(5))["action"]
-    moved = (proposed[0][1] + 0.25 * torch.tensor([1.0, -1.0])).clamp(low, high)
+    moved = proposed[0][1] + 0.25 * (0.5 * (high - low)) * torch.tensor([1.0, -1.0])
+    moved = moved.clamp(low, high)
     assert torch.equal(judged[0][0][1], moved)
     best = (moved - 0.2).square().sum(-1).argmin(-1)
     assert torch.equal(action, moved[torch.arange(5), best])
@@ -263,10 +265,11 @@ def test_policy_of_a_loss_acts_with_its_networks_and_first_critic(
         latent_clip=clip,
         max_perturbation=0.4,
         bounds=(torch.tensor([-0.25, -0.5]), torch.tensor([0.5, 0.75])),
+        edit=undeclared,
     )
-    loss(transitions(8))  # the policy of a loss in use
-    policy = BCQPolicy.from_loss(loss, num_candidates=20)
-    calls = recorded(policy.decoder.module)
+    loss.qvalue_loss(transitions(8))  # the policy of a loss in use
+    policy = BCQPolicy.frozen(loss, num_candidates=20)
+    calls = recorded(policy.generator.module)
     data = transitions(6).select("observation")
     action = policy(data)["action"]
     (observation, latent), _ = calls[0]
@@ -279,7 +282,8 @@ def test_policy_of_a_loss_acts_with_its_networks_and_first_critic(
     if perturbation:
         network = loss.perturbation_network_params["module", "network"]
         xi = np.tanh(numpy_mlp(network, observation, candidates))
-        candidates = np.clip(candidates + 0.4 * xi, [-0.25, -0.5], [0.5, 0.75])
+        moved = candidates + 0.4 * np.array([0.375, 0.625]) * xi
+        candidates = np.clip(moved, [-0.25, -0.5], [0.5, 0.75])
     q = numpy_mlp(loss.qvalue_network_params["module"][0], observation, candidates)[..., 0]
     np.testing.assert_allclose(action, candidates[np.arange(6), q.argmax(-1)], rtol=1e-8)
 
@@ -288,7 +292,7 @@ def test_policy_of_a_loss_acts_with_its_networks_and_first_critic(
 def test_policy_of_a_loss_is_a_copy() -> None:
     loss = make_bcq_loss(perturbation=True)
     before = {key: value.clone() for key, value in loss.state_dict().items()}
-    policy = BCQPolicy.from_loss(loss)
+    policy = BCQPolicy.frozen(loss)
     assert not any(parameter.requires_grad for parameter in policy.parameters())
     assert all(parameter.requires_grad for parameter in loss.parameters())
     data = transitions(6).select("observation")
@@ -415,7 +419,7 @@ def demonstration() -> TensorDict:
 def sources(encoder: TensorDictModule) -> dict[str, Transform]:
     return {
         "prototype": PrototypeTaskLatent(POINT),
-        "online": OnlineTaskLatent(encoder, POINT),
+        "online": OnlineTaskLatent(POINT, encoder),
         "time": DemonstrationTaskLatent(demonstration(), encoder),
         "state": DemonstrationTaskLatent(demonstration(), encoder, alignment="state"),
     }
@@ -448,7 +452,7 @@ def test_prototype_is_constant(batch_size: tuple[int, ...]) -> None:
 def test_online_is_the_embedding_of_the_last_transition_and_the_prototype_at_first(
     batch_size: tuple[int, ...], encoder: TensorDictModule
 ) -> None:
-    env = TransformedEnv(Walk(batch_size), OnlineTaskLatent(encoder, POINT))
+    env = TransformedEnv(Walk(batch_size), OnlineTaskLatent(POINT, encoder))
     for _ in range(2):  # the second episode starts from the prototype again
         rollout = env.rollout(10)
         latent = rollout["task_latent"]
@@ -722,7 +726,7 @@ def test_a_discrete_policy_takes_the_best_action_of_a_q_value_actor() -> None:
     network = nn.Linear(3, 4)
     critic = QValueActor(network, in_keys=["observation"], action_space="one-hot")
     generator = TensorDictModule(nn.Linear(3, 4), in_keys=["observation"], out_keys=["logits"])
-    policy = DiscreteBCQPolicy.from_loss(DiscreteBCQLoss(generator, critic, threshold=0.0))
+    policy = DiscreteBCQPolicy.frozen(DiscreteBCQLoss(generator, critic, threshold=0.0))
     observation = torch.randn(50, 3)
     best = network(observation).argmax(-1)
     assert torch.equal(act(policy, observation=observation).argmax(-1), best)
@@ -751,10 +755,10 @@ def test_a_policy_reads_what_its_networks_read_and_writes_the_action(kind: str) 
     actor = TensorDictModule(actor, in_keys=["goal"], out_keys=["action_latent"])
     entries = {"observation": torch.randn(6, OBSERVATION_DIM)}
     if kind == "bcq":
-        policy = BCQPolicy.from_loss(BCQLoss(generator, critic, bounds=(-1.0, 1.0)))
+        policy = BCQPolicy.frozen(BCQLoss(generator, critic, bounds=(-1.0, 1.0)))
         entries["state"] = torch.randn(6, 5)
     else:
-        policy = PLASPolicy.from_loss(PLASLoss(generator, actor, critic, bounds=(-1.0, 1.0)))
+        policy = PLASPolicy.frozen(PLASLoss(generator, actor, critic, bounds=(-1.0, 1.0)))
         entries["goal"] = torch.randn(6, 6)
     assert set(policy.in_keys) == set(entries)
     assert act(policy, **entries).shape == (6, ACTION_DIM)

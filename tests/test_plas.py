@@ -19,6 +19,7 @@ from helpers import (
     run,
     state,
     transitions,
+    undeclared,
 )
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -28,7 +29,8 @@ from torchrl_bmrl.objectives import PLASLoss
 pytestmark = pytest.mark.filterwarnings(NO_UPDATER)
 GAMMA, LMBDA = 0.99, 0.75
 # Decoded actions reach beyond these bounds, so that clipping shows.
-PERTURBED = {"perturbation": True, "max_perturbation": 0.4, "bounds": (-0.25, 0.25)}
+BOUNDS = {"bounds": (-0.25, 0.25), "edit": undeclared}
+PERTURBED = {"perturbation": True, "max_perturbation": 0.4, **BOUNDS}
 both = pytest.mark.parametrize("options", [{}, PERTURBED], ids=["plain", "perturbed"])
 
 
@@ -43,7 +45,7 @@ def acted(loss: PLASLoss, observation: np.ndarray, prefix: str = "") -> np.ndarr
     if loss.perturbation_network is None:
         return action
     perturbation = np.tanh(numpy_mlp(params("perturbation_network"), observation, action))
-    return np.clip(action + 0.4 * perturbation, -0.25, 0.25)
+    return np.clip(action + 0.4 * 0.25 * perturbation, -0.25, 0.25)
 
 
 @both
@@ -108,7 +110,7 @@ def test_actor_loss_is_minus_the_first_critic_at_the_policy_s_action(
 @both
 def test_the_policy_of_a_loss_acts_like_it_and_is_a_copy(options: dict[str, Any]) -> None:
     loss, data = make_plas_loss(**options), transitions(8)
-    policy = PLASPolicy.from_loss(loss)
+    policy = PLASPolicy.frozen(loss)
     before = state(policy)
     action = policy(data.clone())["action"]
     expected = acted(loss, data["observation"].numpy())

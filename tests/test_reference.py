@@ -97,6 +97,10 @@ def make_perturbation_network() -> TensorDictModule:
     return module(network, ["observation", "action"], "perturbation")
 
 
+# Both bounds cut some actions, so the clipping has its share in values and gradients.
+BOUNDS = (torch.tensor([-0.4, -0.7]).double(), torch.tensor([0.5, 0.6]).double())
+
+
 # -- data and noise ----------------------------------------------------------------------------
 
 
@@ -106,7 +110,7 @@ def transitions(*batch: int) -> TensorDict:
     return TensorDict(
         {
             "observation": torch.randn(*batch, OBSERVATION_DIM).double(),
-            "action": torch.randn(*batch, ACTION_DIM).double().tanh(),
+            "action": torch.randn(*batch, ACTION_DIM).double().tanh().clamp(*BOUNDS),
             "next": {
                 "observation": torch.randn(*batch, OBSERVATION_DIM).double(),
                 "reward": torch.randn(*batch, 1).double(),
@@ -228,8 +232,6 @@ def name_of(options: dict[str, Any]) -> str:
 
 # -- BCQ ---------------------------------------------------------------------------------------
 
-# Both bounds cut some actions, so the clipping has its share in values and gradients.
-BOUNDS = (torch.tensor([-0.4, -0.7]).double(), torch.tensor([0.5, 0.6]).double())
 GENERATIVE = {
     "gamma": 0.97,
     "lmbda": 0.75,

@@ -90,7 +90,7 @@ def load_bcq_loss(path: Path) -> tuple[BCQLoss, dict[str, Any]]:
         >>> state = {"module": make_bcq_loss(**options).state_dict()}
         >>> save_checkpoint(path, state, {"kind": "bcq", "task": "lift", "loss": options})
         >>> loss, metadata = load_bcq_loss(path)
-        >>> BCQPolicy.from_loss(loss).out_keys, metadata["task"]
+        >>> BCQPolicy.frozen(loss).out_keys, metadata["task"]
         (['action'], 'lift')
     """
     state, metadata = load_checkpoint(path, kind="bcq")
@@ -227,7 +227,7 @@ class Student(nn.Module):
         if source == "prototype":
             return PrototypeTaskLatent(self.prototypes[task])
         if source == "online":
-            return OnlineTaskLatent(self.task_encoder, self.prototypes[task])
+            return OnlineTaskLatent(self.prototypes[task], self.task_encoder)
         if source == "demonstration":
             return DemonstrationTaskLatent(demonstration, self.task_encoder)
         raise UnknownNameError("latent source", source, LATENT_SOURCES)
@@ -240,14 +240,14 @@ def make_distillation_loss(
 
     Args:
         student: made for as many tasks as there are teachers.
-        teachers: trained agents, such as :meth:`BCQPolicy.from_loss` gives.
+        teachers: trained agents, such as :meth:`BCQPolicy.frozen` gives.
         **options: of :class:`MetaDistillationLoss`; the latent is the teachers'.
 
     Raises:
         BMRLError: for options that :class:`MetaDistillationLoss` refuses.
 
     Example:
-        >>> teachers = [BCQPolicy.from_loss(make_bcq_loss(num_cells=(8,))) for _ in range(2)]
+        >>> teachers = [BCQPolicy.frozen(make_bcq_loss(num_cells=(8,))) for _ in range(2)]
         >>> make_distillation_loss(Student(num_tasks=2), teachers).num_tasks
         2
     """
@@ -256,7 +256,7 @@ def make_distillation_loss(
         student.task_classifier,
         student.generator,
         student.qvalue_network,
-        [teacher.decoder for teacher in teachers],
+        [teacher.generator for teacher in teachers],
         [teacher.qvalue_network for teacher in teachers],
         latent_dim=teachers[0].latent_dim,
         latent_clip=teachers[0].latent_clip,

@@ -83,14 +83,16 @@ def perturbed_action(
 ) -> Tensor:
     r"""Action moved by the perturbation network within the action's bounds.
 
-    .. math:: a' = \mathrm{clip}(a + \phi\, \xi(s, a),\ a_{low},\ a_{high})
+    .. math:: a' = \mathrm{clip}(a + \phi\, h\, \xi(s, a),\ a_{low},\ a_{high}),\quad
+              h = (a_{high} - a_{low}) / 2
 
-    Reference: BCQ, algorithm 1.
+    Reference: BCQ, algorithm 1; as in the published code, φ is a share of half the action's range,
+    here in each dimension.
 
     Args:
         action: a, ``(*B, action_dim)``.
         perturbation: ξ in [-1, 1], ``(*B, action_dim)``.
-        max_perturbation: φ, at least 0.
+        max_perturbation: φ, at least 0; in units of half the range.
         low: lower bound, ``()`` or ``(action_dim,)``.
         high: upper bound, likewise.
 
@@ -102,7 +104,7 @@ def perturbed_action(
         >>> perturbed_action(torch.tensor([0.98]), torch.tensor([1.0]), 0.05, low, high)
         tensor([1.])
     """
-    return (action + max_perturbation * perturbation).clamp(low, high)
+    return (action + max_perturbation * (0.5 * (high - low)) * perturbation).clamp(low, high)
 
 
 def soft_clipped_value(state_action_value: Tensor, lmbda: float | Tensor) -> Tensor:
@@ -217,7 +219,7 @@ def triplet_error(anchor: Tensor, positive: Tensor, negative: Tensor, margin: fl
     return (near - far + margin).clamp(min=0.0)
 
 
-def isometry_error(task_latent: Tensor, content: Tensor) -> Tensor:
+def isometry_error(task_latent: Tensor, content: Tensor, valid: Tensor | None = None) -> Tensor:
     r"""How far distances in an embedding are from those of what it embeds.
 
     .. math:: \frac{1}{n} \sum_j \left(\lVert m_i - m_j \rVert - \lVert c_i - c_j \rVert\right)^2
@@ -228,6 +230,7 @@ def isometry_error(task_latent: Tensor, content: Tensor) -> Tensor:
     Args:
         task_latent: m, ``(*B, n, d)``.
         content: c, ``(*B, n, k)``.
+        valid: which rows count as j, ``(*B, n)``; ``None`` if all do.
 
     Returns:
         ``(*B, n)``; finite gradients also where two points meet.
@@ -242,7 +245,11 @@ def isometry_error(task_latent: Tensor, content: Tensor) -> Tensor:
         difference = points.unsqueeze(-2) - points.unsqueeze(-3)
         return (difference.square().sum(-1) + 1e-12).sqrt()
 
-    return (distances(task_latent) - distances(content)).square().mean(-1)
+    error = (distances(task_latent) - distances(content)).square()
+    if valid is None:
+        return error.mean(-1)
+    weight = valid.to(error.dtype).unsqueeze(-2)
+    return (error * weight).sum(-1) / weight.sum(-1).clamp(min=1.0)
 
 
 def direction_error(prediction: Tensor, target: Tensor) -> Tensor:

@@ -14,6 +14,8 @@ from torch import Tensor
 from torch.optim import Adam
 from torch.optim.adam import adam
 
+from torchrl_bmrl.errors import BMRLError
+
 Metrics = dict[str, Tensor]
 Update = Callable[[TensorDictBase], Metrics]
 
@@ -31,12 +33,22 @@ def make_adam(params: Iterable[Tensor], lr: float) -> Adam:
         params: what is trained, on one device.
         lr: learning rate.
 
+    Raises:
+        BMRLError: for a parameter that is an expanded or strided view: the fused kernel goes
+            through its memory from the first element on, and would hit others.
+
     Example:
         >>> optimizer = make_adam(torch.nn.Linear(2, 1).parameters(), lr=1e-3)
         >>> optimizer.param_groups[0]["lr"]
         tensor(0.0010)
     """
     params = list(params)
+    for param in params:
+        if not torch.ops.aten.is_non_overlapping_and_dense(param):
+            raise BMRLError(
+                f"a parameter of the shape {tuple(param.shape)} has the strides {param.stride()}; "
+                "valid: one without gaps and overlaps, such as its contiguous()"
+            )
     rate = torch.tensor(lr, device=params[0].device)
     optimizer = Adam(params, lr=rate, fused=True)
     for param in params:
@@ -74,6 +86,10 @@ def load_adam(optimizer: Adam, state: dict[str, Any]) -> None:
     optimizer.load_state_dict(state)
     for group in optimizer.param_groups:
         group["lr"] = group["lr"].to(group["params"][0].device)
+        for param in group["params"]:
+            held = optimizer.state[param]
+            for name in ("exp_avg", "exp_avg_sq"):
+                held[name] = _laid_out_as(param, held[name])
 
 
 def get_rng_state(device: str = "cpu") -> dict[str, Tensor]:
@@ -135,8 +151,8 @@ def gradient_step(optimizer: Adam, loss: Tensor, max_norm: float | None = None) 
     (group,) = optimizer.param_groups
     params = group["params"]
     grads = torch.autograd.grad(loss.sum(), params, materialize_grads=True)
-    # The fused kernel goes through memory as the parameter lies; vmap's gradients lie otherwise.
-    grads = [grad.contiguous() for grad in grads]
+    # The fused kernel goes through memory as the parameter lies; gradients may lie otherwise.
+    grads = [_laid_out_as(param, grad) for param, grad in zip(params, grads, strict=True)]
     state = [optimizer.state[param] for param in params]
     means, squares, steps = (
         [each[name] for each in state] for name in ("exp_avg", "exp_avg_sq", "step")
@@ -164,6 +180,13 @@ def gradient_step(optimizer: Adam, loss: Tensor, max_norm: float | None = None) 
             maximize=False,
             **rates,
         )
+
+
+def _laid_out_as(param: Tensor, value: Tensor) -> Tensor:
+    """The value with the strides of a parameter."""
+    if value.stride() == param.stride():
+        return value
+    return torch.empty_like(param, dtype=value.dtype, requires_grad=False).copy_(value)
 
 
 def _traced_adam(

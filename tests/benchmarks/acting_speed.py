@@ -43,7 +43,7 @@ def plain_action(plain: PlainBCQ, observation: Tensor) -> Tensor:
 def acting(states: int, device: str = "cpu") -> dict[str, Callable[[], Tensor]]:
     """The same networks and states, and the action of each way."""
     plain, loss = make_pair(device=device)
-    policy = BCQPolicy.from_loss(loss, num_candidates=CANDIDATES)
+    policy = BCQPolicy.frozen(loss, num_candidates=CANDIDATES)
     observation = torch.randn(states, OBSERVATION_DIM, device=device)
     return {
         "plain PyTorch": lambda: plain_action(plain, observation),

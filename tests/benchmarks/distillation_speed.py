@@ -40,7 +40,7 @@ def make_update(
     """One update; ``optimizer`` is ``"step"`` as in the recipe or PyTorch's own ``"backward"``."""
     torch.manual_seed(0)
     losses = [make_bcq_loss(observation_dim=OBSERVATION_DIM, action_dim=ACTION_DIM)] * TASKS
-    teachers = [BCQPolicy.from_loss(loss) for loss in losses]
+    teachers = [BCQPolicy.frozen(loss) for loss in losses]
     student = Student(num_tasks=TASKS)
     loss = make_distillation_loss(student, teachers, deactivate_vmap=in_sequence).to(device)
     ours = make_adam(loss.parameters(), lr=LR)

@@ -47,7 +47,7 @@ def make_data(rows: int, task: int) -> TensorDict:
 
 def make_distillation_update(num_tasks: int) -> Update:
     """One update as ``recipes/distill.py`` does it, with untrained teachers."""
-    teachers = [BCQPolicy.from_loss(make_pair(seed)[1]) for seed in range(num_tasks)]
+    teachers = [BCQPolicy.frozen(make_pair(seed)[1]) for seed in range(num_tasks)]
     dims = {"observation_dim": OBSERVATION_DIM, "action_dim": ACTION_DIM}
     student = Student(num_tasks=num_tasks, latent_dim=teachers[0].latent_dim, **dims)
     loss = MetaDistillationLoss(
@@ -55,7 +55,7 @@ def make_distillation_update(num_tasks: int) -> Update:
         student.task_classifier,
         student.generator,
         student.qvalue_network,
-        [teacher.decoder for teacher in teachers],
+        [teacher.generator for teacher in teachers],
         [teacher.qvalue_network for teacher in teachers],
         latent_dim=teachers[0].latent_dim,
         latent_clip=teachers[0].latent_clip,

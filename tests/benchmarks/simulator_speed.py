@@ -123,7 +123,7 @@ def worker_table(episodes: int) -> None:
 
 def policy_table(steps: int = 50) -> None:
     """Time of a step of one episode, a policy of 100 candidates included."""
-    policy = BCQPolicy.from_loss(make_bcq_loss())
+    policy = BCQPolicy.frozen(make_bcq_loss())
     print("\n| Stepper | episodes side by side | ms per step of an episode |\n|---|---:|---:|")
     for stepper in STEPPERS:
         for number in (None, 1, 4, 20):

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import linear
 from torchrl.modules import MLP
+
+from torchrl_bmrl.generators import Autoencoder
 
 
 class CandidateMLP(MLP):
@@ -61,10 +63,17 @@ def _linear(parts: Sequence[tuple[Tensor, Tensor]], bias: Tensor | None = None) 
 
 
 class Network(TensorDictModule):
-    """TensorDictModule whose tensors are written as they are.
+    """TensorDictModule that says its sizes, and whose tensors are written as they are.
 
     tensordict 0.14 looks on the disk for pandas at each output that it writes, a tenth of a small
     update.
+
+    Args:
+        module: what computes.
+        in_keys: keys that it reads.
+        out_keys: keys that it writes.
+        sizes: of the entries, which losses compare between networks.
+        **options: of TensorDictModule.
 
     Example:
         >>> from tensordict import TensorDict
@@ -72,6 +81,23 @@ class Network(TensorDictModule):
         >>> network(TensorDict({"x": torch.zeros(5, 2)}, [5]))["y"].shape
         torch.Size([5, 1])
     """
+
+    def __init__(
+        self,
+        module: nn.Module,
+        in_keys: Sequence[NestedKey],
+        out_keys: Sequence[NestedKey],
+        sizes: Mapping[NestedKey, int] | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(module, in_keys=list(in_keys), out_keys=list(out_keys), **options)
+        self.sizes = dict(sizes or {})
+
+    @property
+    def bounds(self) -> tuple[Tensor, Tensor] | None:
+        """Bounds of what it writes, ``None`` where it has none."""
+        module = self.module
+        return (module.low, module.high) if isinstance(module, _BoundedDecoder) else None
 
     def _write_to_tensordict(
         self,
@@ -88,6 +114,13 @@ class Network(TensorDictModule):
             if key != "_":
                 tensordict.set(key, value)
         return tensordict
+
+
+def _sized(
+    module: nn.Module, reads: Mapping[NestedKey, int], writes: Mapping[NestedKey, int]
+) -> Network:
+    """A network of entries whose sizes are known."""
+    return Network(module, list(reads), list(writes), {**reads, **writes})
 
 
 def make_mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> MLP:
@@ -142,7 +175,7 @@ class _BoundedDecoder(nn.Module):
         return self.low + (self.high - self.low) * unit
 
 
-class ActionVAE(TensorDictModuleBase):
+class ActionVAE(Autoencoder):
     r"""Generator of actions :math:`G`: encoder :math:`q(z | s, a)` and decoder :math:`G(s, z)`.
 
     Reference: Fujimoto et al. 2019, https://arxiv.org/abs/1812.02900, appendix A (latent of twice
@@ -181,22 +214,21 @@ class ActionVAE(TensorDictModuleBase):
         bounds: tuple[float | Tensor, float | Tensor] = (-1.0, 1.0),
         observation_key: NestedKey = "observation",
     ) -> None:
-        super().__init__()
-        self.latent_dim = 2 * action_dim if latent_dim is None else latent_dim
-        self.encoder = Network(
-            _Posterior(observation_dim + action_dim, self.latent_dim, num_cells),
-            in_keys=[observation_key, "action"],
-            out_keys=["action_latent_loc", "action_latent_scale"],
+        size = 2 * action_dim if latent_dim is None else latent_dim
+        encoder = _sized(
+            _Posterior(observation_dim + action_dim, size, num_cells),
+            {observation_key: observation_dim, "action": action_dim},
+            {"action_latent_loc": size, "action_latent_scale": size},
         )
-        self.decoder = make_decoder(
+        decoder = make_decoder(
             observation_dim,
             action_dim,
-            self.latent_dim,
+            size,
             num_cells=num_cells,
             bounds=bounds,
             in_keys=(observation_key, "action_latent"),
         )
-        self.in_keys = [observation_key]
+        super().__init__(encoder, decoder, size)
         self.out_keys = ["action_latent", "action"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -238,12 +270,12 @@ def make_decoder(
         >>> make_decoder(3, 2, 4, task_latent_dim=2).in_keys
         ['observation', 'action_latent', 'task_latent']
     """
-    if in_keys is None:
-        in_keys = ["observation", "action_latent", *(["task_latent"] if task_latent_dim else [])]
-    network = _BoundedDecoder(
-        observation_dim + latent_dim + task_latent_dim, action_dim, num_cells, bounds
-    )
-    return Network(network, in_keys=list(in_keys), out_keys=["action"])
+    sizes = {"observation": observation_dim, "action_latent": latent_dim}
+    if task_latent_dim:
+        sizes["task_latent"] = task_latent_dim
+    network = _BoundedDecoder(sum(sizes.values()), action_dim, num_cells, bounds)
+    reads = dict(zip(sizes if in_keys is None else in_keys, sizes.values(), strict=True))
+    return _sized(network, reads, {"action": action_dim})
 
 
 def make_qvalue_network(
@@ -267,9 +299,11 @@ def make_qvalue_network(
         >>> make_qvalue_network(3, 2).in_keys
         ['observation', 'action']
     """
-    in_keys = ["observation", "action", *(["task_latent"] if task_latent_dim else [])]
-    network = make_mlp(observation_dim + action_dim + task_latent_dim, 1, num_cells)
-    return Network(network, in_keys=in_keys, out_keys=["state_action_value"])
+    reads = {"observation": observation_dim, "action": action_dim}
+    if task_latent_dim:
+        reads["task_latent"] = task_latent_dim
+    network = make_mlp(sum(reads.values()), 1, num_cells)
+    return _sized(network, reads, {"state_action_value": 1})
 
 
 class _Tanh(nn.Module):
@@ -299,7 +333,8 @@ def make_perturbation_network(
         ['perturbation']
     """
     network = _Tanh(make_mlp(observation_dim + action_dim, action_dim, num_cells))
-    return Network(network, in_keys=["observation", "action"], out_keys=["perturbation"])
+    reads = {"observation": observation_dim, "action": action_dim}
+    return _sized(network, reads, {"perturbation": action_dim})
 
 
 def make_latent_actor(
@@ -325,4 +360,4 @@ def make_latent_actor(
         ['action_latent']
     """
     network = _Tanh(make_mlp(observation_dim, latent_dim, num_cells), max_latent)
-    return Network(network, in_keys=["observation"], out_keys=["action_latent"])
+    return _sized(network, {"observation": observation_dim}, {"action_latent": latent_dim})

@@ -48,7 +48,8 @@ def make_task_encoder(
         ['task_latent']
     """
     network = make_mlp(2 * observation_dim + action_dim + 1, task_latent_dim, num_cells)
-    return Network(network, in_keys=list(TRANSITION_KEYS), out_keys=["task_latent"])
+    sizes = {"observation": observation_dim, "action": action_dim, "task_latent": task_latent_dim}
+    return Network(network, in_keys=list(TRANSITION_KEYS), out_keys=["task_latent"], sizes=sizes)
 
 
 def make_one_hot_encoder(num_tasks: int) -> TensorDictModule:
@@ -63,7 +64,8 @@ def make_one_hot_encoder(num_tasks: int) -> TensorDictModule:
         >>> make_one_hot_encoder(3)(TensorDict({"task": torch.tensor([2])}, [1])).get("task_latent")
         tensor([[0., 0., 1.]])
     """
-    return Network(_OneHot(num_tasks), in_keys=["task"], out_keys=["task_latent"])
+    sizes = {"task_latent": num_tasks}
+    return Network(_OneHot(num_tasks), in_keys=["task"], out_keys=["task_latent"], sizes=sizes)
 
 
 class _OneHot(torch.nn.Module):
@@ -92,6 +94,7 @@ def make_task_classifier(num_tasks: int, task_latent_dim: int = 2) -> TensorDict
         torch.nn.Linear(task_latent_dim, num_tasks),
         in_keys=["task_latent"],
         out_keys=["task_logits"],
+        sizes={"task_latent": task_latent_dim},
     )
 
 
@@ -128,6 +131,9 @@ class PrototypeTaskLatent(Transform):
     Args:
         task_latent: the point, ``(m,)``.
 
+    Raises:
+        BMRLError: for anything but a tensor.
+
     Example:
         >>> transform = PrototypeTaskLatent(torch.zeros(2))
         >>> transform(TensorDict({}, [])).get("task_latent")
@@ -138,6 +144,11 @@ class PrototypeTaskLatent(Transform):
 
     def __init__(self, task_latent: Tensor) -> None:
         super().__init__(in_keys=[], out_keys=["task_latent"])
+        if not isinstance(task_latent, Tensor):
+            raise BMRLError(
+                f"task_latent is a {type(task_latent).__name__}; valid: a tensor (m,), before the "
+                "encoder where there is one"
+            )
         self.register_buffer("task_latent", task_latent.detach().clone())
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -176,20 +187,20 @@ class OnlineTaskLatent(PrototypeTaskLatent):
     """Writes the embedding of the last transition; the prototype at the first step.
 
     Args:
-        encoder: :func:`make_task_encoder`'s module, trained.
         task_latent: the prototype of the first step, ``(m,)``.
+        encoder: :func:`make_task_encoder`'s module, trained.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
         >>> from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
-        >>> online = OnlineTaskLatent(make_task_encoder(7, 7), torch.zeros(2))
+        >>> online = OnlineTaskLatent(torch.zeros(2), make_task_encoder(7, 7))
         >>> env = TransformedEnv(ContinuousActionVecMockEnv(), online)
         >>> latent = env.rollout(3)["task_latent"]
         >>> latent.shape, latent[0]
         (torch.Size([3, 2]), tensor([0., 0.]))
     """
 
-    def __init__(self, encoder: TensorDictModule, task_latent: Tensor) -> None:
+    def __init__(self, task_latent: Tensor, encoder: TensorDictModule) -> None:
         super().__init__(task_latent)
         self.encoder = encoder
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from math import inf
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
-from torchrl_bmrl.errors import UnknownNameError
+from torchrl_bmrl.errors import BMRLError, UnknownNameError
+from torchrl_bmrl.objectives.checks import check_number
 
 REDUCTIONS = ("mean", "sum", "none")
 
@@ -22,7 +25,7 @@ class KeyedLoss(LossModule):
     construction with :meth:`keep_keys`.
 
     Keyword Args:
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``; ``None`` is ``"mean"``.
         deactivate_vmap: run ensembles in a loop and not under :func:`torch.vmap`.
         use_prioritized_weights: ``True``, ``False`` or ``"auto"``, as in TorchRL's losses.
 
@@ -36,29 +39,81 @@ class KeyedLoss(LossModule):
         >>> loss.set_keys(reward="points")
         >>> ("next", "points") in loss.in_keys, loss.out_keys[:2]
         (True, ['loss_generator', 'loss_qvalue'])
+        >>> loss.lmbda = 0.5  # as a scheduler does it; a buffer, so that it is saved
+        >>> loss.lmbda
+        tensor(0.5000)
     """
 
     def __init__(
-        self, *, reduction: str, deactivate_vmap: bool, use_prioritized_weights: str | bool
+        self,
+        *,
+        reduction: str | None = None,
+        deactivate_vmap: bool = False,
+        use_prioritized_weights: str | bool = "auto",
     ) -> None:
         super().__init__()
+        reduction = "mean" if reduction is None else reduction
         if reduction not in REDUCTIONS:
             raise UnknownNameError("reduction", reduction, REDUCTIONS)
+        self._coefficients: dict[str, tuple[float, float, bool]] = {}
         self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[str] | None = None
         self.reduction = reduction
         self.deactivate_vmap = deactivate_vmap
         self.use_prioritized_weights = use_prioritized_weights
 
-    def register_coefficients(self, **values: float | None) -> None:
-        """Makes hyper-parameters buffers of the networks' type and device; ``None`` stays so.
+    # -- coefficients ----------------------------------------------------------------------------
+
+    def register_coefficients(
+        self, *, low: float = 0.0, high: float = inf, optional: bool = False, **values: Any
+    ) -> None:
+        """Makes hyper-parameters buffers of the networks' type and device.
+
+        A later assignment of a number, ``loss.lmbda = 0.5``, is checked and goes to the buffer.
 
         Args:
+            low: smallest valid value.
+            high: largest valid value.
+            optional: whether ``None`` is valid; then there is no buffer.
             **values: hyper-parameters by name.
+
+        Raises:
+            BMRLError: for a value out of range, or before the loss has a network.
         """
-        reference = next(self.parameters())
+        if next(self.parameters(), None) is None:
+            raise BMRLError(
+                f"register_coefficients({', '.join(values)}) before the loss has a network; valid: "
+                "after convert_to_functional, whose parameters say the type and device"
+            )
         for name, value in values.items():
-            self.register_coeff_buffer(name, value, device=reference.device, dtype=reference.dtype)
+            value = check_number(name, value, low, high, optional=optional)
+            self.__dict__["_coefficients"][name] = (low, high, optional)
+            self.register_coeff_buffer(name, value, **self._type_and_device)
+
+    @property
+    def _type_and_device(self) -> dict[str, Any]:
+        reference = next(self.parameters())
+        return {"dtype": reference.dtype, "device": reference.device}
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        limits = self.__dict__.get("_coefficients", {}).get(name)
+        if limits is None or isinstance(value, Tensor):
+            super().__setattr__(name, value)
+            return
+        low, high, optional = limits
+        value = check_number(name, value, low, high, optional=optional)
+        buffer = self._buffers.get(name)
+        if value is not None and buffer is not None:
+            buffer.fill_(value)
+            return
+        self.__dict__.pop(name, None)
+        self._buffers.pop(name, None)
+        if value is None:
+            self.__dict__[name] = None
+        else:
+            self.register_coeff_buffer(name, value, **self._type_and_device)
+
+    # -- keys ------------------------------------------------------------------------------------
 
     def keep_keys(self) -> None:
         """Ends the construction: what would be found at the first call is found now.
@@ -71,15 +126,19 @@ class KeyedLoss(LossModule):
     def _make_vmap(self) -> None:
         """Nothing is cached that ``set_vmap_randomness`` would have to renew."""
 
-    # -- keys ------------------------------------------------------------------------------------
-
     def read_keys(self) -> Iterable[NestedKey]:
         """Keys that the loss reads, in a stable order; duplicates are dropped."""
-        raise NotImplementedError
+        raise NotImplementedError(
+            f"{type(self).__name__} has no read_keys(); valid: a method that returns the keys that "
+            "the loss reads, such as ['observation', 'action', ('next', 'reward')]"
+        )
 
     def written_keys(self) -> list[str]:
         """Keys that ``forward`` returns, in order."""
-        raise NotImplementedError
+        raise NotImplementedError(
+            f"{type(self).__name__} has no written_keys(); valid: a method that returns the keys "
+            "that forward() returns, in its order, such as ['loss_qvalue', 'td_error']"
+        )
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -108,6 +167,15 @@ class KeyedLoss(LossModule):
         if self._out_keys is not None:  # construction is over
             self._in_keys = self.in_keys
 
+    def readers(self, key: NestedKey) -> list[str]:
+        """Names of the networks that read a key."""
+        networks = [(name, x) for name, x in vars(self).items() if isinstance(x, nn.Module)]
+        return [
+            name
+            for name, network in networks
+            if any(key in getattr(part, "in_keys", ()) for part in network.modules())
+        ]
+
     # -- reduction -------------------------------------------------------------------------------
 
     def _maybe_get_priority_weight(self, tensordict: TensorDictBase) -> Tensor | None:
@@ -115,6 +183,24 @@ class KeyedLoss(LossModule):
         if self.use_prioritized_weights not in (True, "auto"):
             return None
         return tensordict.get(self.tensor_keys.priority_weight, None)
+
+    def valid_rows(self, tensordict: TensorDictBase, batch: torch.Size) -> Tensor | None:
+        """Which rows count by the data's masks (``loss_mask_key``); ``None`` if all do.
+
+        Args:
+            tensordict: the data.
+            batch: shape of the rows, ``*B``.
+
+        Returns:
+            boolean, ``(*B,)``.
+        """
+        valid = None
+        for key in self._loss_mask_keys():
+            mask = tensordict.get(key, None)
+            if mask is not None:
+                mask = self._expand_loss_mask(mask, mask.new_zeros(()).expand(batch))
+                valid = mask if valid is None else valid & mask
+        return valid
 
     def reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
         """Reduces a loss with the data's masks and priority weights.
@@ -124,7 +210,41 @@ class KeyedLoss(LossModule):
             tensordict: the data.
 
         Returns:
-            ``()``; with ``reduction="none"`` a number for each row that the masks leave.
+            ``()``; with ``reduction="none"`` ``(*B,)``, 0 for the rows that do not count.
         """
         weights = self._maybe_get_priority_weight(tensordict)
+        if weights is not None:
+            weights = unpadded(weights, self.valid_rows(tensordict, weights.shape))
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
+
+
+def unpadded(value: Tensor, valid: Tensor | None) -> Tensor:
+    """A number of each row, 0 for the rows that do not count.
+
+    Args:
+        value: ``(..., *B)``.
+        valid: which rows count, ``(*B,)``; ``None`` if all do.
+
+    Example:
+        >>> unpadded(torch.tensor([1.0, torch.nan]), torch.tensor([True, False]))
+        tensor([1., 0.])
+    """
+    return value if valid is None else torch.where(valid, value, torch.zeros_like(value))
+
+
+def average(value: Tensor, valid: Tensor | None) -> Tensor:
+    """Mean of a metric over the rows that count, detached.
+
+    Args:
+        value: ``(..., *B)``.
+        valid: which rows count, ``(*B,)``; ``None`` if all do.
+
+    Example:
+        >>> average(torch.tensor([1.0, 7.0]), torch.tensor([True, False]))
+        tensor(1.)
+    """
+    value = value.detach()
+    if valid is None:
+        return value.mean()
+    number = valid.sum().clamp(min=1) * (value.numel() // valid.numel())
+    return unpadded(value, valid).sum() / number

@@ -21,22 +21,23 @@ TARGET_DTYPES = ("bfloat16",)
 class BCQLoss(GenerativeLoss):
     r"""Batch-Constrained deep Q-learning.
 
-    A conditional variational autoencoder :math:`G` learns which actions the data hold; the critics
-    :math:`Q_j` bootstrap only from actions that :math:`G` proposes.
+    A generator :math:`G`, as published a conditional variational autoencoder, learns which actions
+    the data hold; the critics :math:`Q_j` bootstrap only from actions that :math:`G` proposes.
 
     Reference: Fujimoto et al., *Off-Policy Deep Reinforcement Learning without Exploration*, ICML
     2019, https://arxiv.org/abs/1812.02900, algorithm 1.
 
     Losses, in update order:
 
-    1. :meth:`generator_loss`:
+    1. :meth:`generator_loss`, of an autoencoder:
        :math:`\lVert G(s, z) - a \rVert^2 / |a| + \beta\, \mathrm{KL}(q(z|s,a)\,\|\,N(0, I)) / |z|`
     2. :meth:`qvalue_loss`: :math:`\sum_j (Q_j(s, a) - y)^2` with
        :math:`y = r + \gamma (1 - \mathrm{terminated}) \max_i
        [\lambda \min_j Q'_j(s', a_i) + (1 - \lambda) \max_j Q'_j(s', a_i)]`, where
        :math:`a_i = G(s', z_i)`, :math:`z_i \sim N(0, I)` clipped to ± ``latent_clip``
     3. :meth:`perturbation_loss` (only with a ``perturbation_network``):
-       :math:`-Q_1(s, a + \phi\,\xi(s, a))` with :math:`a = G(s, z)`
+       :math:`-Q_1(s, a + \phi\, h\, \xi(s, a))` with :math:`a = G(s, z)` and :math:`h` half the
+       action's range
 
     :meth:`forward` computes all of them with the present parameters; a loop that follows the
     published order calls the three methods one after the other and steps each optimizer between.
@@ -44,10 +45,8 @@ class BCQLoss(GenerativeLoss):
     :class:`~torchrl.objectives.SoftUpdate` or :class:`~torchrl.objectives.HardUpdate`.
 
     Args:
-        generator: a module with two :class:`~tensordict.nn.TensorDictModule` children: ``encoder``
-            (observation, action → ``action_latent_loc``, ``action_latent_scale``) and ``decoder``
-            (observation, ``action_latent`` → action), and ``latent_dim``, the size of z, such as
-            :class:`torchrl_bmrl.modules.ActionVAE`.
+        generator: what models the data's actions, such as :class:`torchrl_bmrl.modules.ActionVAE`,
+            or any generator as :mod:`torchrl_bmrl.generators` describes it.
         qvalue_network: list of critics (observation, action → ``state_action_value``), each with
             an initialisation of its own, or one critic, of which ``num_qvalue_nets`` are made.
         perturbation_network: optional module (observation, action → ``perturbation`` in [-1, 1]).
@@ -62,7 +61,7 @@ class BCQLoss(GenerativeLoss):
         kl_weight: β. Default 0.5, as published.
         kl_reduction: whether the divergence is the ``"mean"`` (as published) or the ``"sum"``
             over the latent's dimensions.
-        max_perturbation: φ. Default 0.05.
+        max_perturbation: φ, a share of half the action's range, in each dimension. Default 0.05.
         value_bounds: ``(low, high)`` that the next states' value is clamped to; ``None`` for none.
             With rewards in [0, 1], (0, 1 / (1 - γ)) holds back a critic that runs away.
         target_dtype: ``"bfloat16"`` proposes and values the next states' actions in that type
@@ -72,7 +71,7 @@ class BCQLoss(GenerativeLoss):
         gamma: discount of the default TD(0) estimator. Default 0.99.
         separate_losses: parameters that critics or perturbation network share with the generator
             are trained by the generator's loss alone.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``; ``None`` is ``"mean"``.
         deactivate_vmap: run the critics in a loop and not under :func:`torch.vmap`.
         use_prioritized_weights: ``True``, ``False`` or ``"auto"``, as in TorchRL's losses.
 
@@ -81,11 +80,12 @@ class BCQLoss(GenerativeLoss):
     Key written to the input: ``td_error (*B,)``, the priority.
 
     Raises:
-        BMRLError: for candidates below one, λ outside [0, 1], a generator without encoder,
-            decoder and ``latent_dim``, no critics, an unknown ``loss_function``, ``reduction``,
-            ``kl_reduction`` or ``target_dtype``, bounds in the wrong order, or bounds and spec
-            given together or not at all; and at a call for data with missing keys, other shapes
-            or, on CPU and not compiled, numbers that are not finite.
+        BMRLError: for candidates below one, λ outside [0, 1], a generator that lacks a part,
+            bounds that are not the generator's, networks of different sizes, no critics, an
+            unknown ``loss_function``, ``reduction``, ``kl_reduction`` or ``target_dtype``, bounds
+            in the wrong order, or bounds and spec given together or not at all; and at a call for
+            data with missing keys, other shapes or, on CPU and not compiled, numbers that are not
+            finite or actions outside the bounds.
 
     Example:
         >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
@@ -129,7 +129,7 @@ class BCQLoss(GenerativeLoss):
         loss_function: str = "l2",
         gamma: float = 0.99,
         separate_losses: bool = False,
-        reduction: str = "mean",
+        reduction: str | None = "mean",
         deactivate_vmap: bool = False,
         use_prioritized_weights: str | bool = "auto",
     ) -> None:
@@ -140,6 +140,7 @@ class BCQLoss(GenerativeLoss):
             bounds=bounds,
             kl_weight=kl_weight,
             kl_reduction=kl_reduction,
+            latent_clip=latent_clip,
             max_perturbation=max_perturbation,
             loss_function=loss_function,
             gamma=gamma,
@@ -153,10 +154,7 @@ class BCQLoss(GenerativeLoss):
         if target_dtype not in (None, *TARGET_DTYPES):
             raise UnknownNameError("target_dtype", target_dtype, (None, *TARGET_DTYPES))
         self.target_dtype = target_dtype
-        self.register_coefficients(
-            lmbda=check_number("lmbda", lmbda, 0, 1),
-            latent_clip=check_number("latent_clip", latent_clip, optional=True),
-        )
+        self.register_coefficients(high=1.0, lmbda=lmbda)
         self.convert_critics(qvalue_network, num_qvalue_nets)
         self.finish()
 
@@ -166,8 +164,7 @@ class BCQLoss(GenerativeLoss):
             "loss_generator",
             "loss_qvalue",
             *(["loss_perturbation"] if self.perturbation_network is not None else []),
-            "reconstruction_error",
-            "kl_divergence",
+            *self.generator_metrics,
             "pred_value",
             "target_value",
             "next_state_value",
@@ -184,9 +181,9 @@ class BCQLoss(GenerativeLoss):
         """
         with torch.no_grad():
             after = self.rows(tensordict, self.observation_keys, after=True)
-            after = after.unsqueeze(-1).expand(*after.batch_size, self.num_candidates)
             with self._target_precision():
-                proposals = self.perturb(self.propose(after, self.latent_clip), target=True)
+                proposals = self.propose(after, self.num_candidates)
+                proposals = self.perturb(proposals, target=True)
                 candidates = self.qvalue(proposals, target=True)
             next_value = bcq_next_value(candidates.to(self.lmbda.dtype), self.lmbda)
             if self.value_bounds is not None:
@@ -221,7 +218,7 @@ class BCQLoss(GenerativeLoss):
             raise BMRLError("this BCQLoss was made without a perturbation_network")
         with torch.no_grad():
             observation = self.rows(tensordict, self.observation_keys)
-            proposal = self.propose(observation, self.latent_clip)
+            proposal = self.propose(observation, 1).squeeze(-1)
         proposal = self.perturb(proposal)
         value = self.qvalue(proposal, frozen=True)[0]
         loss = self.reduce(-value, tensordict)

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
 from math import inf, isfinite
+from numbers import Integral, Real
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase, is_batchedtensor
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_bmrl.errors import BMRLError
+
+TOLERANCE = 1e-3
+"""An action may lie outside its bounds by this share of their distance: it is rounding."""
 
 
 def check_number(
@@ -23,11 +29,11 @@ def check_number(
     integer: bool = False,
     optional: bool = False,
 ) -> Any:
-    """An option that is a number.
+    """An option that is a number, as a Python number.
 
     Args:
         name: the option, for the message.
-        value: what was given.
+        value: what was given: a Python or numpy number, or a tensor of one.
         low: smallest valid value.
         high: largest valid value.
         integer: whether it must be an integer.
@@ -42,14 +48,16 @@ def check_number(
     """
     if value is None and optional:
         return value
-    kind = (int,) if integer else (int, float)
-    number = isinstance(value, kind) and not isinstance(value, bool)
+    given = value
+    if isinstance(value, Tensor) and value.numel() == 1:
+        value = value.item()
+    number = isinstance(value, Integral if integer else Real) and not isinstance(value, bool)
     if not number or not low <= value <= high:
         span = f"between {low:g} and {high:g}" if high < inf else f"at least {low:g}"
         raise BMRLError(
-            f"{name} is {value!r}; valid: {span}{', an integer' * integer}{', or None' * optional}"
+            f"{name} is {given!r}; valid: {span}{', an integer' * integer}{', or None' * optional}"
         )
-    return value
+    return int(value) if isinstance(value, Integral) else float(value)
 
 
 def check_value_bounds(bounds: tuple[float, float] | None) -> tuple[float, float] | None:
@@ -60,7 +68,7 @@ def check_value_bounds(bounds: tuple[float, float] | None) -> tuple[float, float
     """
     if bounds is None:
         return None
-    if not isinstance(bounds, (list, tuple)) or len(bounds) != 2 or not bounds[0] < bounds[1]:
+    if not isinstance(bounds, Sequence) or len(bounds) != 2 or not bounds[0] < bounds[1]:
         raise BMRLError(f"value_bounds are {bounds}; valid: (low, high) with low < high, or None")
     return bounds[0], bounds[1]
 
@@ -121,10 +129,92 @@ def check_index(key: NestedKey, index: Tensor, count: int) -> None:
         raise BMRLError(f"{key!r} holds {low if low < 0 else high}; valid: 0 to {count - 1}")
 
 
+def check_one_hot(key: NestedKey, action: Tensor, valid: Tensor | None) -> None:
+    """Refuses rows that name no action, or several; on CPU and not compiled.
+
+    A row names an action where one entry is above a half and the others together are below it:
+    0.999 and a smoothed label do.
+
+    Args:
+        key: of the action.
+        action: ``(*B, n)``.
+        valid: which rows count, ``(*B,)``; ``None`` if all do.
+
+    Raises:
+        BMRLError: naming the first such row.
+
+    Example:
+        >>> check_one_hot("action", torch.tensor([[0.0, 0.999], [0.9, 0.1]]), None)
+        >>> check_one_hot("action", torch.tensor([[0.5, 0.5]]), None)
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.BMRLError: 'action' names no single action in 1 rows, the first, ...
+    """
+    if not readable(action):
+        return
+    weight = action.to(torch.get_default_dtype())
+    largest = weight.amax(-1)
+    others = weight.abs().sum(-1) - largest
+    unclear = ~((largest > 0.5) & (others < 0.5))
+    if valid is not None:
+        unclear &= valid
+    if unclear.any():
+        first = tuple(unclear.nonzero()[0].tolist())
+        raise BMRLError(
+            f"{key!r} names no single action in {int(unclear.sum())} rows, the first, "
+            f"{action[first].tolist()}, at {first}; valid: rows with one entry near 1 and the "
+            "others near 0"
+        )
+
+
+def check_within(
+    key: NestedKey, action: Tensor, low: Tensor, high: Tensor, valid: Tensor | None
+) -> None:
+    """Refuses actions that no policy within the bounds can take; on CPU and not compiled.
+
+    Args:
+        key: of the action.
+        action: ``(*B, action_dim)``.
+        low: lower bound, ``()`` or ``(action_dim,)``.
+        high: upper bound, likewise.
+        valid: which rows count, ``(*B,)``; ``None`` if all do.
+
+    Raises:
+        BMRLError: naming the first such number, or bounds of another length.
+
+    Example:
+        >>> low, high = torch.tensor(-1.0), torch.tensor(1.0)
+        >>> check_within("action", torch.tensor([[0.5, 1.9]]), low, high, None)
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.BMRLError: 'action' holds 1 numbers outside the bounds, the first, ...
+    """
+    if low.ndim and low.shape != action.shape[-1:]:
+        raise BMRLError(
+            f"{key!r} has the shape {tuple(action.shape)} and the bounds {tuple(low.shape)}; "
+            "valid: a bound for each dimension"
+        )
+    if not (readable(action) and readable(low)):
+        return
+    slack = TOLERANCE * (high - low)
+    outside = (action < low - slack) | (action > high + slack)
+    if valid is not None:
+        outside &= valid.unsqueeze(-1)
+    if outside.any():
+        first = tuple(outside.nonzero()[0].tolist())
+        raise BMRLError(
+            f"{key!r} holds {int(outside.sum())} numbers outside the bounds, the first, "
+            f"{action[first].item():g}, at {first}; valid: {low.tolist()} to {high.tolist()}, or "
+            "bounds of the loss and of the generator that are those of the data"
+        )
+
+
 def readable(value: Tensor) -> bool:
     """Whether Python may look at the numbers: on CPU, neither compiled nor under vmap."""
     return not (
-        torch.compiler.is_compiling() or value.device.type != "cpu" or is_batchedtensor(value)
+        torch.compiler.is_compiling()
+        or value.device.type != "cpu"
+        or torch._C._functorch.is_batchedtensor(value)
     )
 
 
@@ -138,23 +228,31 @@ def next_key(key: NestedKey) -> tuple[str, ...]:
     return ("next", key) if isinstance(key, str) else ("next", *key)
 
 
-def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+def entry(tensordict: TensorDictBase, key: NestedKey, mask: Tensor | None = None) -> Tensor:
     """One entry of the data, finite.
 
     On CPU a number that is not finite is refused; elsewhere that would wait for the device, and
     in a compiled loss it cannot be said.
 
+    Args:
+        tensordict: the data.
+        key: of the entry.
+        mask: which rows count, ``(*B,)``. The others may hold anything: they come back as zeros,
+            so that nothing in them reaches a number or a gradient.
+
     Raises:
         BMRLError: if it is missing, or holds NaN or infinity.
 
     Example:
-        >>> from tensordict import TensorDict
         >>> entry(TensorDict({"reward": torch.tensor([1.0])}, []), "reward")
         tensor([1.])
     """
     value = tensordict.get(key, None)
     if value is None:
         raise missing(tensordict, key)
+    if mask is not None and value.shape[: mask.ndim] == mask.shape:
+        valid = mask.reshape(*mask.shape, *[1] * (value.ndim - mask.ndim))
+        value = torch.where(valid, value, torch.zeros_like(value))
     if not readable(value):
         return value
     # The sum is cheap and tells all but what only adds up to infinity.
@@ -169,10 +267,17 @@ def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
     return value
 
 
-def missing(tensordict: TensorDictBase, key: NestedKey) -> BMRLError:
-    """The error for an entry that the data lack."""
+def missing(tensordict: TensorDictBase, key: NestedKey, readers: Sequence[str] = ()) -> BMRLError:
+    """The error for an entry that the data lack.
+
+    Args:
+        tensordict: the data.
+        key: of the entry.
+        readers: the networks that read it under this name.
+    """
     present = [str(key) for key in tensordict.keys(include_nested=True, leaves_only=True)]
-    return BMRLError(f"the data have no {key!r}; they have: {', '.join(present) or 'nothing'}")
+    who = f", which {' and '.join(readers)} read{'s' * (len(readers) == 1)}" if readers else ""
+    return BMRLError(f"the data have no {key!r}{who}; they have: {', '.join(present) or 'nothing'}")
 
 
 def read(module: TensorDictModule, tensordict: TensorDictBase) -> TensorDictBase:
@@ -188,12 +293,115 @@ def read(module: TensorDictModule, tensordict: TensorDictBase) -> TensorDictBase
     except torch.OutOfMemoryError:
         raise
     except (RuntimeError, KeyError) as error:
-        entries = ((key, tensordict.get(key, None)) for key in module.in_keys)
-        seen = ", ".join(
-            f"{key!r} {'missing' if x is None else f'{tuple(x.shape)} {x.dtype}'}"
-            for key, x in entries
-        )
+        raise unfit(module, tensordict, error) from error
+
+
+def unfit(module: Any, tensordict: TensorDictBase, error: Exception) -> BMRLError:
+    """The error for data that a network cannot read."""
+    entries = [(key, tensordict.get(key, None)) for key in module.in_keys]
+    seen = ", ".join(
+        f"{key!r} {'missing' if x is None else f'{tuple(x.shape)} {x.dtype}'}" for key, x in entries
+    )
+    types = {x.dtype for _, x in entries if x is not None and x.is_floating_point()}
+    weight = next(module.parameters(), None)
+    other = weight is not None and bool(types) and types != {weight.dtype}
+    return BMRLError(
+        f"a network cannot read {seen} ({error}); valid: the sizes and types that it was made for"
+        + other
+        * f". Its parameters are {getattr(weight, 'dtype', '')}: convert the data, as "
+        "torchrl.envs.transforms.DoubleToFloat does, or the loss, as loss.double() does"
+    )
+
+
+# -- sizes, said in more than one place ------------------------------------------------------------
+
+Sizes = Mapping[NestedKey, int]
+
+
+def agreed_sizes(networks: Iterable[tuple[str, Any]]) -> dict[NestedKey, int]:
+    """Sizes of the entries, as the networks say them (``network.sizes``).
+
+    Args:
+        networks: names and networks; those that say nothing are passed over.
+
+    Raises:
+        BMRLError: if two of them say different sizes of one entry.
+
+    Example:
+        >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
+        >>> agreed_sizes([("generator", ActionVAE(3, 2)), ("critic", make_qvalue_network(3, 1))])
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.BMRLError: 'action' has the size 2 in generator and 1 in critic; ...
+    """
+    known: dict[NestedKey, tuple[str, int]] = {}
+    for name, network in networks:
+        for key, size in (getattr(network, "sizes", None) or {}).items():
+            first, other = known.setdefault(key, (name, size))
+            if other != size:
+                raise BMRLError(
+                    f"{key!r} has the size {other} in {first} and {size} in {name}; valid: one "
+                    "size for all networks"
+                )
+    return {key: size for key, (_, size) in known.items()}
+
+
+def check_fit(name: str, network: TensorDictModule, sizes: Sizes) -> None:
+    """Runs a network once on entries of the known sizes; a lazy one gets its parameters by it.
+
+    Nothing is computed: the run is on the meta device. A network that reads an entry of unknown
+    size is left to the first batch.
+
+    Args:
+        name: of the network, for the message.
+        network: what is run.
+        sizes: of the entries.
+
+    Raises:
+        BMRLError: if the network cannot read them, writes another size than a known one, or is
+            lazy and reads an entry of unknown size.
+    """
+    lazy = any(torch.nn.parameter.is_lazy(p) for p in network.parameters())
+    unknown = [key for key in network.in_keys if key not in sizes]
+    if lazy and unknown:
         raise BMRLError(
-            f"a network cannot read {seen} ({error}); valid: the sizes and types that it was "
-            "made for"
-        ) from error
+            f"{name} has parameters without a shape and reads {unknown}, whose size is not known; "
+            f"valid: a network that has run once, {name}(data)"
+        )
+    if unknown:
+        return
+    if lazy:
+        # On its own device, in evaluation: a run must not move the statistics of a BatchNorm.
+        training = network.training
+        with torch.no_grad():
+            _run(name, network.eval(), sizes, None)
+        network.train(training)
+    try:
+        copy = deepcopy(network).to("meta")
+    except (NotImplementedError, RuntimeError, TypeError):
+        return  # a network that cannot be copied is left to the first batch
+    _run(name, copy, sizes, "meta")
+
+
+def _run(name: str, network: Any, sizes: Sizes, device: str | None) -> None:
+    weight = next((p for p in network.parameters() if p.is_floating_point()), None)
+    device = device or (None if weight is None else str(weight.device))
+    dtype = None if weight is None else weight.dtype
+    entries = {
+        key: torch.zeros(2, sizes[key], device=device, dtype=dtype) for key in network.in_keys
+    }
+    try:
+        written = network(TensorDict(entries, [2]))
+    except NotImplementedError:
+        return
+    except RuntimeError as error:
+        if "meta" in str(error):
+            return  # it looks at numbers, or holds a tensor that did not move
+        raise unfit(network, TensorDict(entries, [2]), error) from error
+    for key in network.out_keys:
+        value = written.get(key, None)
+        if value is not None and key in sizes and value.shape[-1] != sizes[key]:
+            raise BMRLError(
+                f"{name} writes {key!r} of the size {value.shape[-1]}; valid: {sizes[key]}, as the "
+                "other networks have it"
+            )

@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import (
     ValueEstimators,
@@ -23,8 +24,10 @@ from torchrl.objectives.utils import (
 from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.objectives.base import KeyedLoss
+from torchrl_bmrl.objectives.base import KeyedLoss, average, unpadded
 from torchrl_bmrl.objectives.checks import (
+    agreed_sizes,
+    check_fit,
     check_network,
     check_number,
     entry,
@@ -35,6 +38,7 @@ from torchrl_bmrl.objectives.checks import (
 )
 from torchrl_bmrl.objectives.ensemble import kind
 from torchrl_bmrl.objectives.swap import holding, leaves, without_gradient
+from torchrl_bmrl.ownership import note_copied
 
 LOSS_FUNCTIONS = ("l2", "l1", "smooth_l1")
 
@@ -53,7 +57,7 @@ class OfflineLoss(KeyedLoss):
         loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"`` (Huber) between value and target.
         separate_losses: parameters that a network shares with the ``generator`` are trained by
             the generator's loss alone.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``; ``None`` is ``"mean"``.
         deactivate_vmap: run the critics in a loop and not under :func:`torch.vmap`.
         use_prioritized_weights: ``True``, ``False`` or ``"auto"``, as in TorchRL's losses.
 
@@ -111,7 +115,7 @@ class OfflineLoss(KeyedLoss):
         gamma: float = 0.99,
         loss_function: str = "l2",
         separate_losses: bool = False,
-        reduction: str = "mean",
+        reduction: str | None = "mean",
         deactivate_vmap: bool = False,
         use_prioritized_weights: str | bool = "auto",
     ) -> None:
@@ -122,7 +126,7 @@ class OfflineLoss(KeyedLoss):
         )
         if loss_function not in LOSS_FUNCTIONS:
             raise UnknownNameError("loss_function", loss_function, LOSS_FUNCTIONS)
-        self.gamma = check_number("gamma", gamma, 0, 1)
+        self._gamma = check_number("gamma", gamma, 0, 1)
         self.loss_function = loss_function
         self.separate_losses = separate_losses
 
@@ -144,10 +148,15 @@ class OfflineLoss(KeyedLoss):
             default: number of critics made from a single one.
 
         Raises:
-            BMRLError: for no critics, a number that is not the list's length, or a single critic
-                that cannot be initialised anew.
+            BMRLError: for no critics, a number that is not the list's length, a critic that cannot
+                read the entries as the other networks do, or a single critic that cannot be
+                initialised anew.
         """
-        if isinstance(qvalue_network, (list, tuple, nn.ModuleList)):
+        several = isinstance(qvalue_network, (Sequence, nn.ModuleList))
+        for critic in qvalue_network if several else [qvalue_network]:
+            check_network("a critic" if several else "qvalue_network", critic)
+            self.check_sizes("qvalue_network", critic)
+        if several:
             critics = list(qvalue_network)
             if not critics or num_qvalue_nets not in (None, len(critics)):
                 raise BMRLError(
@@ -155,14 +164,14 @@ class OfflineLoss(KeyedLoss):
                     f"{num_qvalue_nets}; valid: at least one critic, and their number or None"
                 )
         else:
-            check_network("qvalue_network", qvalue_network)
             count = default if num_qvalue_nets is None else num_qvalue_nets
-            check_number("num_qvalue_nets", count, 1, integer=True)
+            count = check_number("num_qvalue_nets", count, 1, integer=True)
             taken = list(self.parameters())
             critics = [qvalue_network, *(_renewed(qvalue_network, taken) for _ in range(count - 1))]
-        for critic in critics:
-            check_network("a critic", critic)
         self.num_qvalue_nets = len(critics)
+        self._flat_rows = any(
+            isinstance(part, _BatchNorm) for critic in critics for part in critic.modules()
+        )
         owners = [id(p) for critic in critics for p in critic.parameters()]
         known = {id(p) for p in self.parameters()}
         # Stacking makes new parameters and keeps one structure, so critics that differ, or share
@@ -176,6 +185,8 @@ class OfflineLoss(KeyedLoss):
             and known.isdisjoint(owners)
         )
         if self._stacked:
+            for critic in critics:
+                note_copied(critic, type(self).__name__)
             self.convert_to_functional(
                 critics,
                 "qvalue_network",
@@ -203,6 +214,31 @@ class OfflineLoss(KeyedLoss):
             if isinstance(params, TensorDictParams)
         }
 
+    def check_sizes(self, name: str, network: Any) -> None:
+        """Compares what a network reads and writes with the networks that the loss already has.
+
+        Args:
+            name: of the network, for the message.
+            network: that is about to be taken over.
+
+        Raises:
+            BMRLError: if they do not fit together, see :func:`.checks.check_fit`.
+        """
+        others = [(key, x) for key, x in vars(self).items() if isinstance(x, nn.Module)]
+        check_fit(name, network, agreed_sizes([*others, (name, network)]))
+
+    def _reset_module_parameters(self, module_name: str, module: Any) -> None:
+        """Initialises a network anew, each critic on its own, and copies it to its target."""
+        params = getattr(self, f"{module_name}_params")
+        stacked = module_name == "qvalue_network" and self._stacked
+        for own in params.unbind(0) if stacked else [params]:
+            fresh = deepcopy(module)
+            fresh.reset_parameters_recursive()
+            own.data.update_(TensorDict.from_module(fresh).data)
+        target = self._modules.get(f"target_{module_name}_params")
+        if target is not None:
+            target.data.update_(params.data)
+
     def critic(self, index: int = 0) -> tuple[TensorDictModule, TensorDictBase]:
         """One critic: its module and the parameters that belong into it.
 
@@ -227,24 +263,17 @@ class OfflineLoss(KeyedLoss):
         """
         attribute = f"target_{name}_params" if target else f"{name}_params"
         shared = self._shared_with_generator[attribute] if self.separate_losses else []
+        params = getattr(self, attribute)
         if torch.compiler.is_compiling():
-            params = getattr(self, attribute)
             if frozen:
                 return params.detach()
             return without_gradient(params, shared) if shared else params
+        module = getattr(self, name)
         if shared and not frozen:
-            return leaves(without_gradient(getattr(self, attribute), shared))
-        # TorchRL forgets whatever is named _cache when the loss moves to another type or device.
-        cache = self.__dict__.setdefault("_cache_leaves", {})
-        if attribute not in cache:
-            cache[attribute] = leaves(getattr(self, attribute))
-        if frozen and torch.is_grad_enabled():
-            return [leaf.detach() for leaf in cache[attribute]]
-        return cache[attribute]
-
-    def __getstate__(self) -> dict[str, Any]:
-        # A copy's parameters are others.
-        return {key: value for key, value in self.__dict__.items() if key != "_cache_leaves"}
+            return leaves(without_gradient(params, shared), module)
+        # Looked up at every call: the parameters may have been replaced since the last one.
+        own = leaves(params, module)
+        return [leaf.detach() for leaf in own] if frozen and torch.is_grad_enabled() else own
 
     def call(
         self, name: str, tensordict: TensorDictBase, *, target: bool = False, frozen: bool = False
@@ -288,6 +317,10 @@ class OfflineLoss(KeyedLoss):
         """
         network = self.qvalue_network
         inputs = tensordict.select(*network.in_keys)
+        if self._flat_rows and inputs.ndim > 1:
+            # A BatchNorm takes the second of more than two dimensions for its features.
+            values = self.evaluate(inputs.reshape(-1), key, target=target, frozen=frozen)
+            return values.unflatten(1, inputs.batch_size)
         if not self._stacked:
             values = self.call("qvalue_network", inputs, target=target, frozen=frozen)
             return output(values, key, network)
@@ -356,6 +389,16 @@ class OfflineLoss(KeyedLoss):
 
     # -- target, priority, reduction -------------------------------------------------------------
 
+    @property
+    def gamma(self) -> float:
+        """Discount of the value estimator; an assignment changes the estimator's."""
+        return self._gamma
+
+    @gamma.setter
+    def gamma(self, value: float) -> None:
+        self._gamma = check_number("gamma", value, 0, 1)
+        self.value_estimator.gamma.fill_(self._gamma)
+
     def make_value_estimator(
         self: Self,
         value_type: ValueEstimators | ValueEstimatorBase | type | None = None,
@@ -375,6 +418,7 @@ class OfflineLoss(KeyedLoss):
         ):
             LossModule.make_value_estimator(self, value_type, **hyperparams)
             self._forward_value_estimator_keys()
+            self._gamma = float(getattr(self.value_estimator, "gamma", self._gamma))
             return self
         estimator = dispatch_value_estimator(
             self,
@@ -386,7 +430,8 @@ class OfflineLoss(KeyedLoss):
         )
         # TorchRL keeps hyper-parameters in float32; 0.99 is another number there.
         estimator.to(next(self.parameters()))
-        exact = default_value_kwargs(self.value_type) | {"gamma": self.gamma} | hyperparams
+        exact = default_value_kwargs(self.value_type) | {"gamma": self._gamma} | hyperparams
+        self._gamma = check_number("gamma", exact["gamma"], 0, 1)
         for name, value in exact.items():
             if name in dict(estimator.named_buffers()):
                 estimator.get_buffer(name).fill_(value)
@@ -403,9 +448,11 @@ class OfflineLoss(KeyedLoss):
             BMRLError: for a reward or flag that is missing, not ``(*B, 1)`` or not finite.
         """
         keys = self.tensor_keys
+        valid = self.valid_rows(tensordict, next_value.shape)
         next_value = next_value.unsqueeze(-1)
+        data = tensordict.copy().set(next_key(keys.state_action_value), next_value)
         for key in self.outcome_keys:
-            value = entry(tensordict, key)
+            value = entry(tensordict, key, valid)
             shape = value.shape
             if key != next_key(keys.reward) and value.dtype != torch.bool:
                 raise BMRLError(f"{key!r} is {value.dtype}; valid: torch.bool")
@@ -414,7 +461,12 @@ class OfflineLoss(KeyedLoss):
                     f"{key!r} has the shape {tuple(shape)}; valid: {tuple(next_value.shape)}, the "
                     "action's with a last dimension of one"
                 )
-        data = tensordict.copy().set(next_key(keys.state_action_value), next_value)
+            if valid is not None:
+                if key == next_key(keys.done):
+                    # A return must not go on from the last row that counts into the padding.
+                    goes_on = torch.cat([valid[..., 1:], valid[..., -1:]], -1)
+                    value = value | ~(valid & goes_on).unsqueeze(-1)
+                data.set(key, value)
         return self.value_estimator.value_estimate(data).squeeze(-1).detach()
 
     def temporal_difference(
@@ -429,15 +481,17 @@ class OfflineLoss(KeyedLoss):
 
         Returns:
             the loss and, detached, ``td_error (num_qvalue_nets, *B)``, ``pred_value``,
-            ``target_value`` and ``next_state_value``.
+            ``target_value`` and ``next_state_value``. Rows that a mask leaves out have the error 0
+            and count in no mean.
         """
         target = self.td_target(tensordict, next_value)
         distance = distance_loss(predicted, target.expand_as(predicted), self.loss_function)
+        valid = self.valid_rows(tensordict, target.shape)
         return self.reduce(distance.sum(0), tensordict), {
-            "td_error": (predicted - target).detach().square(),
-            "pred_value": predicted.detach().mean(),
-            "target_value": target.mean(),
-            "next_state_value": next_value.detach().mean(),
+            "td_error": unpadded((predicted - target).detach().square(), valid),
+            "pred_value": average(predicted, valid),
+            "target_value": average(target, valid),
+            "next_state_value": average(next_value, valid),
         }
 
     # -- data ------------------------------------------------------------------------------------
@@ -451,7 +505,7 @@ class OfflineLoss(KeyedLoss):
         key = self.tensor_keys.action
         action = tensordict.get(key, None)
         if action is None:
-            raise missing(tensordict, key)
+            raise missing(tensordict, key, self.readers(key))
         if not action.numel():
             raise BMRLError(f"{key!r} has the shape {tuple(action.shape)}; valid: one row at least")
         return action.shape[:-1]
@@ -470,15 +524,20 @@ class OfflineLoss(KeyedLoss):
             BMRLError: for a missing key, a number that is not finite, or another batch shape.
         """
         batch = self.batch_shape(tensordict)
-        values = {key: entry(tensordict, next_key(key) if after else key) for key in keys}
-        for key, value in values.items():
+        valid = self.valid_rows(tensordict, batch)
+        values = {}
+        for key in keys:
+            full = next_key(key) if after else key
+            if tensordict.get(full, None) is None:
+                raise missing(tensordict, full, self.readers(key))
+            values[key] = value = entry(tensordict, full, valid)
             if value.shape[: len(batch)] != batch:
-                full = next_key(key) if after else key
                 raise BMRLError(
                     f"{full!r} has the shape {tuple(value.shape)}; valid: {tuple(batch)} and its "
                     "own dimensions, as the action has"
                 )
-        if tensordict.batch_size == batch and all(isinstance(key, str) for key in values):
+        simple = valid is None and all(isinstance(key, str) for key in values)
+        if simple and tensordict.batch_size == batch:
             return (tensordict.get("next") if after else tensordict).select(*values)
         # Made new: what a keyword call nests has a batch size of its own.
         result = TensorDict({}, batch_size=batch)

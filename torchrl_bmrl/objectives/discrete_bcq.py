@@ -9,13 +9,16 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.data.tensor_specs import Categorical, Composite, OneHot, TensorSpec
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.functional import likely_actions
+from torchrl_bmrl.objectives.base import average
 from torchrl_bmrl.objectives.checks import (
     check_index,
     check_network,
-    check_number,
+    check_one_hot,
+    check_same_shape,
     entry,
     missing,
     next_key,
@@ -51,8 +54,10 @@ class DiscreteBCQLoss(OfflineLoss):
         qvalue_network: critic, or list of critics (observation → ``action_value (*B, n)``).
 
     Keyword Args:
-        action_space: how ``action`` is written: ``"one-hot"``, ``(*B, n)``, as
-            :class:`~torchrl.envs.GymEnv` has it, or ``"categorical"``, ``(*B,)`` or ``(*B, 1)``.
+        action_space: how ``action`` is written: ``"one-hot"`` (or ``"one_hot"``), ``(*B, n)``, as
+            :class:`~torchrl.envs.GymEnv` has it, ``"categorical"``, ``(*B,)`` or ``(*B, 1)``, or
+            the spec of the action, :class:`~torchrl.data.OneHot` or
+            :class:`~torchrl.data.Categorical`.
         num_qvalue_nets: number of critics; default 1 from a single one, else the list's length.
         threshold: τ. Default 0.3. 0 is Double DQN, 1 is imitation.
         logits_weight: w. Default 0.01.
@@ -60,7 +65,7 @@ class DiscreteBCQLoss(OfflineLoss):
         gamma: discount of the default TD(0) estimator. Default 0.99.
         separate_losses: parameters that the critics share with the generator are trained by the
             generator's loss alone. Default ``False``, as published for a common convolution.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``; ``None`` is ``"mean"``.
         deactivate_vmap: run the critics in a loop and not under :func:`torch.vmap`.
         use_prioritized_weights: ``True``, ``False`` or ``"auto"``, as in TorchRL's losses.
 
@@ -120,14 +125,14 @@ class DiscreteBCQLoss(OfflineLoss):
         generator: TensorDictModule,
         qvalue_network: TensorDictModule | list[TensorDictModule],
         *,
-        action_space: str = "one-hot",
+        action_space: str | TensorSpec = "one-hot",
         num_qvalue_nets: int | None = None,
         threshold: float = 0.3,
         logits_weight: float = 1e-2,
         loss_function: str = "smooth_l1",
         gamma: float = 0.99,
         separate_losses: bool = False,
-        reduction: str = "mean",
+        reduction: str | None = "mean",
         deactivate_vmap: bool = False,
         use_prioritized_weights: str | bool = "auto",
     ) -> None:
@@ -139,15 +144,12 @@ class DiscreteBCQLoss(OfflineLoss):
             deactivate_vmap=deactivate_vmap,
             use_prioritized_weights=use_prioritized_weights,
         )
-        if action_space not in ACTION_SPACES:
-            raise UnknownNameError("action_space", action_space, ACTION_SPACES)
-        self.action_space = action_space
+        self.action_space, self.num_actions = action_space_of(action_space, self.tensor_keys.action)
         check_network("generator", generator)
+        self.check_sizes("generator", generator)
         self.convert_to_functional(generator, "generator", create_target_params=False)
-        self.register_coefficients(
-            threshold=check_number("threshold", threshold, 0, 1),
-            logits_weight=check_number("logits_weight", logits_weight),
-        )
+        self.register_coefficients(high=1.0, threshold=threshold)
+        self.register_coefficients(logits_weight=logits_weight)
         self.convert_critics(qvalue_network, num_qvalue_nets, default=1)
         self.finish()
 
@@ -187,7 +189,7 @@ class DiscreteBCQLoss(OfflineLoss):
         key = self.tensor_keys.action
         action = tensordict.get(key, None)
         if action is None:
-            raise missing(tensordict, key)
+            raise missing(tensordict, key, self.readers(key))
         if self.action_space == "categorical" and action.ndim == max(tensordict.ndim, 1):
             return action.shape
         return action.shape[:-1]
@@ -203,18 +205,21 @@ class DiscreteBCQLoss(OfflineLoss):
             BMRLError: for an action that is not written as ``action_space`` says.
         """
         key, batch = self.tensor_keys.action, self.batch_shape(tensordict)
-        action = entry(tensordict, key)
-        width = num_actions if self.action_space == "one-hot" else 1
-        if action.shape not in (batch, (*batch, width)):
+        action = entry(tensordict, key, self.valid_rows(tensordict, batch))
+        one_hot = self.action_space == "one-hot"
+        shapes = [(*batch, num_actions)] if one_hot else [tuple(batch), (*batch, 1)]
+        if action.shape not in shapes:
             raise BMRLError(
                 f"{key!r} has the shape {tuple(action.shape)}; valid for action_space="
-                f"{self.action_space!r}: {(*batch, width)}"
+                f"{self.action_space!r}: {' or '.join(map(str, shapes))}"
             )
-        if self.action_space == "one-hot":
-            return action.to(torch.uint8).argmax(-1)
-        action = action.reshape(batch)
-        check_index(key, action, num_actions)
-        return action.long()
+        if not one_hot:
+            action = action.reshape(batch)
+            check_index(key, action, num_actions)
+            return action.long()
+        check_one_hot(key, action, self.valid_rows(tensordict, batch))
+        # In the action's own type: as an integer 0.999 is 0.
+        return (action.to(torch.uint8) if action.dtype == torch.bool else action).argmax(-1)
 
     def logits(self, tensordict: TensorDictBase, *, after: bool = False) -> Tensor:
         """Logits of the generator, ``(*B, n)``.
@@ -224,7 +229,13 @@ class DiscreteBCQLoss(OfflineLoss):
             after: whether at the next state.
         """
         data = self.rows(tensordict, self.generator.in_keys, after=after)
-        return output(self.call("generator", data), self.tensor_keys.logits, self.generator)
+        logits = output(self.call("generator", data), self.tensor_keys.logits, self.generator)
+        if self.num_actions not in (None, logits.shape[-1]):
+            raise BMRLError(
+                f"{self.tensor_keys.logits!r} has the shape {tuple(logits.shape)}, and the spec of "
+                f"the action {self.num_actions} actions; valid: a logit for each action"
+            )
+        return logits
 
     def qvalue(
         self, tensordict: TensorDictBase, *, target: bool = False, frozen: bool = False
@@ -238,6 +249,20 @@ class DiscreteBCQLoss(OfflineLoss):
         """
         key = self.tensor_keys.action_value
         return self.evaluate(tensordict, key, target=target, frozen=frozen)
+
+    def likely(self, tensordict: TensorDictBase, value: Tensor) -> Tensor:
+        """Which actions of the next state are likely enough, ``(*B, n)``.
+
+        Args:
+            tensordict: the data.
+            value: of every action there, ``(*B, n)``.
+
+        Raises:
+            BMRLError: if generator and critics know different numbers of actions.
+        """
+        logits = self.logits(tensordict, after=True)
+        check_same_shape(self.tensor_keys.action_value, value, logits)
+        return likely_actions(logits, self.threshold)
 
     # -- losses, in update order -----------------------------------------------------------------
 
@@ -253,7 +278,8 @@ class DiscreteBCQLoss(OfflineLoss):
         loss = cross_entropy + self.logits_weight * logits.square().mean(-1)
         loss = self.reduce(loss, tensordict)
         self._clear_weakrefs(tensordict, "generator_params")
-        return loss, {"cross_entropy": cross_entropy.detach().mean()}
+        valid = self.valid_rows(tensordict, cross_entropy.shape)
+        return loss, {"cross_entropy": average(cross_entropy, valid)}
 
     def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Critics' loss, summed over the critics; gradients reach the critics alone.
@@ -264,9 +290,10 @@ class DiscreteBCQLoss(OfflineLoss):
         """
         with torch.no_grad():
             after = self.rows(tensordict, self.qvalue_network.in_keys, after=True)
-            allowed = likely_actions(self.logits(tensordict, after=True), self.threshold)
             value = self.qvalue(after).amin(0)
-            best = value.masked_fill(~allowed, -torch.inf).argmax(-1, keepdim=True)
+            best = value.masked_fill(~self.likely(tensordict, value), -torch.inf).argmax(
+                -1, keepdim=True
+            )
             value = self.qvalue(after, target=True).amin(0)
             next_value = value.gather(-1, best).squeeze(-1)
         data = self.rows(tensordict, self.qvalue_network.in_keys)
@@ -291,3 +318,31 @@ class DiscreteBCQLoss(OfflineLoss):
         tensordict.set(self.tensor_keys.priority, qvalue_info.pop("td_error").amax(0))
         losses = {"loss_generator": loss_generator, "loss_qvalue": loss_qvalue}
         return TensorDict(losses | generator_info | qvalue_info)
+
+
+def action_space_of(
+    action_space: str | TensorSpec, action_key: NestedKey
+) -> tuple[str, int | None]:
+    """How actions are written, and how many there are where a spec says it.
+
+    Args:
+        action_space: ``"one-hot"``, ``"one_hot"``, ``"categorical"``, or a spec.
+        action_key: where the spec lies in a composite one.
+
+    Raises:
+        UnknownNameError: for anything else.
+
+    Example:
+        >>> action_space_of("one_hot", "action"), action_space_of(OneHot(4), "action")
+        (('one-hot', None), ('one-hot', 4))
+    """
+    if isinstance(action_space, Composite):
+        action_space = action_space[action_key]
+    if isinstance(action_space, OneHot):
+        return "one-hot", action_space.space.n
+    if isinstance(action_space, Categorical):
+        return "categorical", action_space.space.n
+    name = action_space.replace("_", "-") if isinstance(action_space, str) else action_space
+    if name not in ACTION_SPACES:
+        raise UnknownNameError("action_space", action_space, ACTION_SPACES)
+    return str(name), None

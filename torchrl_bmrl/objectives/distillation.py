@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,8 +21,10 @@ from torchrl_bmrl.functional import (
     squared_error,
     triplet_error,
 )
-from torchrl_bmrl.objectives.base import KeyedLoss
+from torchrl_bmrl.objectives.base import KeyedLoss, average, unpadded
 from torchrl_bmrl.objectives.checks import (
+    agreed_sizes,
+    check_fit,
     check_index,
     check_network,
     check_number,
@@ -101,7 +103,7 @@ class MetaDistillationLoss(KeyedLoss):
         context_fraction: share of each batch whose m comes from ``context``; the rest is
             ``"current"``.
         context_size: transitions in a set.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``; ``None`` is ``"mean"``.
         deactivate_vmap: run the teachers in a loop.
         use_prioritized_weights: as in TorchRL's losses.
 
@@ -214,7 +216,7 @@ class MetaDistillationLoss(KeyedLoss):
         context: str = "set",
         context_fraction: float = 0.5,
         context_size: int = 8,
-        reduction: str = "mean",
+        reduction: str | None = "mean",
         deactivate_vmap: bool = False,
         use_prioritized_weights: str | bool = "auto",
     ) -> None:
@@ -230,18 +232,17 @@ class MetaDistillationLoss(KeyedLoss):
             )
         if context not in CONTEXTS:
             raise UnknownNameError("context", context, CONTEXTS)
-        check_number("context_fraction", context_fraction, 0, 1)
-        check_number("context_size", context_size, 1, integer=True)
-        check_number("latent_dim", latent_dim, 1, integer=True)
-        check_number("latent_clip", latent_clip, optional=True)
-        check_number("metric_margin", metric_margin)
+        context_fraction = check_number("context_fraction", context_fraction, 0, 1)
+        context_size = check_number("context_size", context_size, 1, integer=True)
+        latent_dim = check_number("latent_dim", latent_dim, 1, integer=True)
         if not teacher_generators:
             raise BMRLError("no teachers; valid: at least one generator and critic")
-        for term in [encoder_terms] if isinstance(encoder_terms, str) else encoder_terms:
+        encoder_terms = (encoder_terms,) if isinstance(encoder_terms, str) else encoder_terms
+        for term in encoder_terms:
             if term not in ENCODER_TERMS:
                 raise UnknownNameError("encoder term", term, ENCODER_TERMS)
-        check_number("metric_weight", metric_weight)
-        check_number("isometry_weight", isometry_weight)
+        metric_weight = check_number("metric_weight", metric_weight)
+        isometry_weight = check_number("isometry_weight", isometry_weight)
         if metric_weight and len(teacher_generators) < 2:
             raise BMRLError("metric_weight needs at least two tasks, one to be away from")
         self.num_tasks = len(teacher_generators)
@@ -250,15 +251,28 @@ class MetaDistillationLoss(KeyedLoss):
         self.context_fraction = context_fraction
         self.context_size = context_size
         self.encoder_terms = tuple(encoder_terms)
-        self.metric_margin = metric_margin
+        self.metric_margin = check_number("metric_margin", metric_margin)
 
-        for name, module in (
-            ("task_encoder", task_encoder),
-            ("task_classifier", task_classifier),
-            ("student_generator", student_generator),
-            ("student_qvalue_network", student_qvalue_network),
-        ):
+        students = {
+            "task_encoder": task_encoder,
+            "task_classifier": task_classifier,
+            "student_generator": student_generator,
+            "student_qvalue_network": student_qvalue_network,
+        }
+        teachers = [("a teacher's generator", x) for x in teacher_generators]
+        teachers += [("a teacher's critic", x) for x in teacher_qvalue_networks]
+        for name, module in [*students.items(), *teachers]:
             check_network(name, module)
+        sizes = agreed_sizes([*students.items(), *teachers])
+        said = sizes.setdefault(self.tensor_keys.action_latent, latent_dim)
+        if said != latent_dim:
+            raise BMRLError(
+                f"latent_dim is {latent_dim}; valid: {said}, the size that the decoders read"
+            )
+        for name, module in [*students.items(), *teachers]:
+            check_fit(name, module, sizes)
+        _check_equal_bounds([("student_generator", student_generator), *teachers])
+        for name, module in students.items():
             self.convert_to_functional(module, name, create_target_params=False)
         self.teacher_generators = FrozenEnsemble(teacher_generators)
         self.teacher_qvalue_networks = FrozenEnsemble(teacher_qvalue_networks)
@@ -276,15 +290,15 @@ class MetaDistillationLoss(KeyedLoss):
                     f"{self.num_tasks} tasks{', above 0' * name.endswith('scale')}"
                 )
             self.register_buffer(name, buffer)
-        for name, value in (
-            ("classification_weight", classification_weight),
-            ("generator_weight", generator_weight),
-            ("direction_weight", direction_weight),
-            ("qvalue_weight", qvalue_weight),
-            ("latent_norm_weight", latent_norm_weight),
-        ):
-            self.register_coefficients(**{name: check_number(name, value)})
         self.register_coefficients(
+            classification_weight=classification_weight,
+            generator_weight=generator_weight,
+            direction_weight=direction_weight,
+            qvalue_weight=qvalue_weight,
+            latent_norm_weight=latent_norm_weight,
+        )
+        self.register_coefficients(
+            optional=True,
             latent_clip=latent_clip,
             metric_weight=metric_weight or None,
             isometry_weight=isometry_weight or None,
@@ -332,30 +346,39 @@ class MetaDistillationLoss(KeyedLoss):
             BMRLError: for missing keys, and for ``context="previous"`` without ``"previous"``.
         """
         keys = self.task_encoder.in_keys
-        for key in keys:
-            entry(tensordict, key)
-        latent = self._encode(tensordict.select(*keys))
+        latent = self._encode(self._entries(tensordict, keys))
         if self.context == "current":
             return latent
         if self.context == "previous":
-            previous = tensordict.get(self.tensor_keys.previous, None)
-            if previous is None:
+            name = self.tensor_keys.previous
+            if tensordict.get(name, None) is None:
                 raise BMRLError(
-                    f"the data have no {self.tensor_keys.previous!r}, which context='previous' "
+                    f"the data have no {name!r}, which context='previous' "
                     "reads; valid: data of torchrl_bmrl.data.with_previous, or another context: "
                     + ", ".join(name for name in CONTEXTS if name != "previous")
                 )
-            for key in keys:
-                entry(tensordict, unravel_key((self.tensor_keys.previous, key)))
-            other = self._encode(previous.select(*keys))
+            other = self._encode(self._entries(tensordict, keys, under=name))
         else:
             # Rows of a task are draws from its data: others of the same row are its context.
             size = self.context_size if self.context == "set" else 1
-            rows = latent.shape[1]
-            index = torch.randint(rows, (rows, size), device=latent.device)
-            other = latent[:, index].mean(2)
+            valid = self.valid_rows(tensordict, latent.shape[:2])
+            other = _drawn(latent, valid, size).mean(2)
         chosen = torch.rand(latent.shape[:2], device=latent.device) < self.context_fraction
         return torch.where(chosen.unsqueeze(-1), other, latent)
+
+    def _entries(
+        self, tensordict: TensorDictBase, keys: Iterable[NestedKey], under: NestedKey = ()
+    ) -> TensorDictBase:
+        """Some entries, zeros in the rows that a mask leaves out."""
+        batch = tensordict.batch_size
+        valid = self.valid_rows(tensordict, batch)
+        entries = {key: entry(tensordict, unravel_key((under, key)), valid) for key in keys}
+        if valid is None:
+            return (tensordict.get(under) if under else tensordict).select(*entries)
+        result = TensorDict({}, batch)
+        for key, value in entries.items():
+            result.set(key, value)
+        return result
 
     def _encode(self, transition: TensorDictBase) -> Tensor:
         return self._run("task_encoder", transition, self.tensor_keys.task_latent)
@@ -375,9 +398,7 @@ class MetaDistillationLoss(KeyedLoss):
             ``state_action_value (num_tasks, B, 1)``.
         """
         keys = self.tensor_keys
-        for key in self._teacher_observation_keys:
-            entry(tensordict, key)
-        data = tensordict.select(*self._teacher_observation_keys)
+        data = self._entries(tensordict, self._teacher_observation_keys)
         latent = sample_action_latent(
             (*data.batch_size, self.latent_dim),
             latent_clip=self.latent_clip,
@@ -446,11 +467,12 @@ class MetaDistillationLoss(KeyedLoss):
             )
         return logits
 
-    def separate(self, task_latent: Tensor) -> Tensor:
+    def separate(self, task_latent: Tensor, valid: Tensor | None = None) -> Tensor:
         """Triplet error of each row's m against another row of its task and one of another.
 
         Args:
             task_latent: m, ``(num_tasks, B, m)``.
+            valid: which rows count, ``(num_tasks, B)``; ``None`` if all do.
 
         Returns:
             ``(num_tasks, B)``.
@@ -458,25 +480,31 @@ class MetaDistillationLoss(KeyedLoss):
         num_tasks, rows = task_latent.shape[:2]
         device = task_latent.device
         # A cyclic shift by 1 to n - 1 is never the row, or the task, itself.
-        shift = torch.randint(1, max(rows, 2), (rows,), device=device)
-        near = task_latent[:, (torch.arange(rows, device=device) + shift) % rows]
+        if valid is None:
+            shift = torch.randint(1, max(rows, 2), (rows,), device=device)
+            near = task_latent[:, (torch.arange(rows, device=device) + shift) % rows]
+            far = task_latent
+        else:
+            near, far = (_drawn(task_latent, valid, 1).squeeze(2) for _ in range(2))
         shift = torch.randint(1, num_tasks, (num_tasks, rows), device=device)
         task = (torch.arange(num_tasks, device=device).unsqueeze(-1) + shift) % num_tasks
         row = torch.randint(rows, (num_tasks, rows), device=device)
-        return triplet_error(task_latent, near, task_latent[task, row], self.metric_margin)
+        return triplet_error(task_latent, near, far[task, row], self.metric_margin)
 
     def spread_out(self, tensordict: TensorDictBase) -> Tensor:
         """Error of each row's distances in m to its task's other rows, ``(num_tasks, B)``."""
-        reward = entry(tensordict, next_key(self.tensor_keys.reward))
+        valid = self.valid_rows(tensordict, tensordict.batch_size)
+        reward = entry(tensordict, next_key(self.tensor_keys.reward), valid)
         with torch.no_grad():
             # What the demonstrator did, without its noise.
-            data = tensordict.select(*self._teacher_observation_keys)
+            data = self._entries(tensordict, self._teacher_observation_keys)
             centre = self.qvalue_loc.new_zeros(*data.batch_size, self.latent_dim)
             data = data.copy().set(self.tensor_keys.action_latent, centre)
             action = self._ask(self.teacher_generators, data).get(self.tensor_keys.action)
         content = torch.cat([reward / self.reward_scale[:, None, None], action], -1)
         # Not embed's: m of a set has no reward and action of its own.
-        return isometry_error(self._encode(tensordict.select(*self.task_encoder.in_keys)), content)
+        m = self._encode(self._entries(tensordict, self.task_encoder.in_keys))
+        return isometry_error(m, content, valid)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -490,7 +518,8 @@ class MetaDistillationLoss(KeyedLoss):
                 f"the data's batch size is {list(tensordict.batch_size)}; valid: "
                 f"[{self.num_tasks}, B], one row per teacher"
             )
-        task = entry(tensordict, self.tensor_keys.task)
+        valid = self.valid_rows(tensordict, tensordict.batch_size)
+        task = entry(tensordict, self.tensor_keys.task, valid)
         if task.shape != tensordict.batch_size:
             raise BMRLError(
                 f"{self.tensor_keys.task!r} has the shape {tuple(task.shape)}; valid: "
@@ -522,12 +551,38 @@ class MetaDistillationLoss(KeyedLoss):
             "loss_latent_norm": self.latent_norm_weight * norm,
         }
         if self.metric_weight is not None:
-            terms["loss_metric"] = self.metric_weight * self.separate(reaching["metric"])
+            terms["loss_metric"] = self.metric_weight * self.separate(reaching["metric"], valid)
         if self.isometry_weight is not None:
             terms["loss_isometry"] = self.isometry_weight * self.spread_out(tensordict)
-        tensordict.set(self.tensor_keys.priority, sum(terms.values()).detach())
+        priority = sum(terms.values()).detach()
+        tensordict.set(self.tensor_keys.priority, unpadded(priority, valid))
         losses = {name: self.reduce(term, tensordict) for name, term in terms.items()}
-        losses["accuracy"] = (logits.argmax(-1) == task).to(logits.dtype).mean()
-        losses["latent_norm"] = norm.detach().mean().sqrt()
+        losses["accuracy"] = average((logits.argmax(-1) == task).to(logits.dtype), valid)
+        losses["latent_norm"] = average(norm, valid).sqrt()
         self._clear_weakrefs(tensordict, taught, "student_generator_params")
         return TensorDict(losses)
+
+
+def _drawn(task_latent: Tensor, valid: Tensor | None, number: int) -> Tensor:
+    """For each row the m of some rows of its task, ``(num_tasks, B, number, m)``."""
+    num_tasks, rows, size = task_latent.shape
+    if valid is None:
+        return task_latent[:, torch.randint(rows, (rows, number), device=task_latent.device)]
+    # A task without a row that counts draws from all: its terms count nowhere.
+    weight = (valid | ~valid.any(-1, keepdim=True)).to(task_latent.dtype)
+    index = torch.multinomial(weight, rows * number, replacement=True)
+    chosen = task_latent.gather(1, index.unsqueeze(-1).expand(-1, -1, size))
+    return chosen.view(num_tasks, rows, number, size)
+
+
+def _check_equal_bounds(networks: Sequence[tuple[str, Any]]) -> None:
+    """Refuses decoders that say different bounds of the action."""
+    said = [(name, x.bounds) for name, x in networks if getattr(x, "bounds", None) is not None]
+    for name, bounds in said[1:]:
+        first, other = said[0]
+        for one, two in zip(other, bounds, strict=True):
+            if not torch.equal(*torch.broadcast_tensors(one.double(), two.double())):
+                raise BMRLError(
+                    f"the actions of {name} end at {two.tolist()}, those of {first} at "
+                    f"{one.tolist()}; valid: equal bounds"
+                )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import inspect
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -14,19 +15,16 @@ from torch import Tensor
 from torchrl.data.tensor_specs import Bounded, Composite, TensorSpec
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.functional import (
-    gaussian_kl,
-    perturbed_action,
-    sample_action_latent,
-    squared_error,
-)
+from torchrl_bmrl.functional import perturbed_action
+from torchrl_bmrl.generators import LOSS_OPTIONS, PROPOSAL_OPTIONS, as_generator, check_written
+from torchrl_bmrl.objectives.base import average
 from torchrl_bmrl.objectives.checks import (
     check_network,
-    check_number,
     check_same_shape,
+    check_within,
     next_key,
     output,
-    read,
+    unfit,
 )
 from torchrl_bmrl.objectives.common import OfflineLoss
 from torchrl_bmrl.objectives.swap import holding
@@ -35,34 +33,34 @@ KL_REDUCTIONS = ("mean", "sum")
 
 
 class GenerativeLoss(OfflineLoss):
-    r"""Base of losses around a conditional variational autoencoder of the data's actions.
+    r"""Base of losses around a generator of the data's actions.
 
-    It brings the autoencoder's own loss, :meth:`generator_loss`, and the way from a latent to an
-    action, :meth:`propose`, :meth:`decode` and :meth:`perturb`. The generator has no target.
-
-    Reference: Kingma and Welling, *Auto-Encoding Variational Bayes*, ICLR 2014,
-    https://arxiv.org/abs/1312.6114, conditioned on the state as in BCQ,
-    https://arxiv.org/abs/1812.02900.
+    It brings the generator's own loss, :meth:`generator_loss`, its proposals, :meth:`propose`, and
+    for a generator with a latent the way from there to an action, :meth:`decode`, and back,
+    :meth:`encode`. The generator has no target.
 
     Args:
-        generator: a module with two :class:`~tensordict.nn.TensorDictModule` children: ``encoder``
-            (observation, action → ``action_latent_loc``, ``action_latent_scale``) and ``decoder``
-            (observation, ``action_latent`` → action), and ``latent_dim``, the size of z, such as
-            :class:`torchrl_bmrl.modules.ActionVAE`.
+        generator: what models the data's actions, see :mod:`torchrl_bmrl.generators`; such as
+            :class:`torchrl_bmrl.modules.ActionVAE`. A module with ``encoder`` (observation, action
+            → ``action_latent_loc``, ``action_latent_scale``), ``decoder`` (observation,
+            ``action_latent`` → action) and ``latent_dim`` is taken for an autoencoder.
         perturbation_network: optional module (observation, action → ``perturbation`` in [-1, 1]).
 
     Keyword Args:
         action_spec: bounded spec of the action. Exclusive with ``bounds``.
         bounds: ``(low, high)`` of the action. Exclusive with ``action_spec``.
-        kl_weight: β.
-        kl_reduction: whether the divergence is the ``"mean"`` or the ``"sum"`` over the latent's
-            dimensions.
-        max_perturbation: φ.
+        kl_weight: β, of an autoencoder.
+        kl_reduction: whether an autoencoder's divergence is the ``"mean"`` or the ``"sum"`` over
+            the latent's dimensions.
+        latent_clip: bound on the latent of proposed actions, ``None`` for none.
+        max_perturbation: φ, a share of half the action's range.
         **options: of :class:`~torchrl_bmrl.objectives.common.OfflineLoss`.
 
     Raises:
-        BMRLError: for a generator without encoder, decoder and ``latent_dim``, bounds and spec
-            given together or not at all, or an unknown ``kl_reduction``.
+        BMRLError: for a generator that lacks a part, bounds and spec given together or not at all,
+            bounds that are not the generator's or of another length than its actions, networks
+            whose sizes differ, an unknown ``kl_reduction``, or an option that the generator does
+            not take; and on CPU at a call for actions outside the bounds.
 
     Example:
         >>> from tensordict import TensorDict
@@ -112,53 +110,123 @@ class GenerativeLoss(OfflineLoss):
         bounds: tuple[float | Tensor, float | Tensor] | None = None,
         kl_weight: float = 0.5,
         kl_reduction: str = "mean",
+        latent_clip: float | None = None,
         max_perturbation: float = 0.05,
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        for part in ("encoder", "decoder", "latent_dim"):
-            if not hasattr(generator, part):
-                raise BMRLError(
-                    f"generator {type(generator).__name__} has no {part!r}; valid: a module with "
-                    "'encoder', 'decoder' and 'latent_dim', such as "
-                    "torchrl_bmrl.modules.ActionVAE"
-                )
+        generator = as_generator(generator)
         if kl_reduction not in KL_REDUCTIONS:
             raise UnknownNameError("kl_reduction", kl_reduction, KL_REDUCTIONS)
         self.kl_reduction = kl_reduction
+        self.check_sizes("generator", generator)
         self.convert_to_functional(generator, "generator", create_target_params=False)
+        low, high = action_bounds(action_spec, bounds, self.tensor_keys.action)
+        self._check_bounds(low, high)
+        reference = next(generator.parameters())
+        self.register_buffer("action_low", low.to(reference))
+        self.register_buffer("action_high", high.to(reference))
         if perturbation_network is None:
             self.perturbation_network = None
         else:
             check_network("perturbation_network", perturbation_network)
+            self.check_sizes("perturbation_network", perturbation_network)
             self.convert_to_functional(
                 perturbation_network, "perturbation_network", create_target_params=True
             )
-        reference = next(generator.parameters())
-        low, high = action_bounds(action_spec, bounds, self.tensor_keys.action)
-        self.register_buffer("action_low", low.to(reference))
-        self.register_buffer("action_high", high.to(reference))
-        self.register_coefficients(
-            kl_weight=check_number("kl_weight", kl_weight),
-            max_perturbation=check_number("max_perturbation", max_perturbation),
-        )
+        self.register_coefficients(max_perturbation=max_perturbation)
+        self._refuse_unread(kl_weight=kl_weight, kl_reduction=kl_reduction, latent_clip=latent_clip)
+        if "kl_weight" in generator.options:
+            self.register_coefficients(kl_weight=kl_weight)
+        self.register_coefficients(latent_clip=latent_clip, optional=True)
+
+    def _check_bounds(self, low: Tensor, high: Tensor) -> None:
+        """Refuses bounds that say something else than the generator."""
+        size = (getattr(self.generator, "sizes", None) or {}).get(self.tensor_keys.action)
+        own = getattr(self.generator, "bounds", None)
+        for name, bound, other in zip(
+            ("lower", "upper"), (low, high), own or (None, None), strict=True
+        ):
+            if size is not None and bound.ndim and len(bound) != size:
+                raise BMRLError(
+                    f"the {name} bound of the action has {len(bound)} numbers; valid: a number, or "
+                    f"{size}, as the generator's actions have"
+                )
+            if other is None:
+                continue
+            other = torch.as_tensor(other).to(bound)
+            one, two = torch.broadcast_tensors(bound, other)
+            if not torch.allclose(one, two):
+                raise BMRLError(
+                    f"the {name} bound of the action is {bound.tolist()}, and the generator's "
+                    f"{other.tolist()}; valid: equal ones, such as "
+                    "ActionVAE(..., bounds=(spec.space.low, spec.space.high))"
+                )
+
+    def _refuse_unread(self, **options: Any) -> None:
+        """Refuses an option that was given and that the generator does not take."""
+        parameters = inspect.signature(type(self).__init__).parameters
+        for name, value in options.items():
+            given = name in parameters and value != parameters[name].default
+            if given and name not in self.generator.options:
+                raise BMRLError(
+                    f"{name} is {value!r}, and generator {type(self.generator).__name__} does not "
+                    f"take it; valid: its options, {', '.join(self.generator.options) or 'none'}"
+                )
+
+    def _options(self, names: tuple[str, ...]) -> dict[str, Any]:
+        """Those of some options that the generator takes."""
+        return {name: getattr(self, name) for name in names if name in self.generator.options}
 
     @property
     def observation_keys(self) -> list[NestedKey]:
-        """What decoder and ``state_networks`` read of a state."""
+        """What generator and ``state_networks`` read of a state."""
         networks = [getattr(self, name) for name in self.state_networks]
         keys = [key for network in networks if network is not None for key in network.in_keys]
         made = (self.tensor_keys.action_latent, self.tensor_keys.action)
-        keys = [*self.generator.decoder.in_keys, *keys]
+        keys = [*getattr(self.generator, "decoder", self.generator).in_keys, *keys]
         return [key for key in dict.fromkeys(keys) if key not in made]
 
     def read_keys(self) -> Iterable[NestedKey]:
         """Observation and action, and what followed."""
-        now = dict.fromkeys([*self.generator.encoder.in_keys, *self.observation_keys])
+        now = dict.fromkeys([*self._training_keys, *self.observation_keys])
         after = map(next_key, self.observation_keys)
         return [*now, self.tensor_keys.action, *after, *self.outcome_keys]
 
-    # -- from a latent to an action --------------------------------------------------------------
+    @property
+    def _training_keys(self) -> list[NestedKey]:
+        """What the generator's own loss reads beside the action."""
+        return getattr(self.generator, "encoder", self.generator).in_keys
+
+    @property
+    def generator_metrics(self) -> list[str]:
+        """Names of the metrics of :meth:`generator_loss`, for ``written_keys``."""
+        return list(self.generator.metrics)
+
+    # -- from a state to actions -----------------------------------------------------------------
+
+    def propose(self, observation: TensorDictBase, num_candidates: int) -> TensorDictBase:
+        """The observation with actions that the generator proposes, a draw for each.
+
+        No gradient reaches the generator.
+
+        Args:
+            observation: what the generator reads of a state, batch ``[*B]``.
+            num_candidates: actions for each state.
+
+        Returns:
+            batch ``[*B, num_candidates]``.
+
+        Raises:
+            BMRLError: if the observation does not fit the generator, or this writes other keys.
+        """
+        keys = self.tensor_keys
+        options = self._options(PROPOSAL_OPTIONS)
+        with holding(self.generator, self.weights("generator", frozen=True)):
+            proposed = self._ask(self.generator.propose, observation, num_candidates, **options)
+        if proposed.get(keys.action, None) is None:
+            check_written(proposed, keys.action, self.generator)
+        return proposed
 
     def decode(self, observation: TensorDictBase, latent: Tensor) -> TensorDictBase:
         """The observation with the latent and the action that the generator decodes from it.
@@ -170,29 +238,48 @@ class GenerativeLoss(OfflineLoss):
             latent: z, ``(*B, latent_dim)``.
 
         Raises:
-            BMRLError: if they do not fit the decoder.
+            BMRLError: if they do not fit the decoder, or the generator has no latent.
         """
         data = observation.copy().set(self.tensor_keys.action_latent, latent)
-        with holding(self.generator, self.weights("generator", frozen=True)):
-            return read(self.generator.decoder, data)
+        return self._with_latent("decode", data)
 
-    def propose(
-        self, observation: TensorDictBase, latent_clip: float | Tensor | None
-    ) -> TensorDictBase:
-        """The observation with an action decoded from z ~ N(0, I) within ± ``latent_clip``.
+    def encode(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The data with the mean and standard deviation of the posterior of z.
+
+        A gradient may reach the action, never the generator.
 
         Args:
-            observation: what the decoder reads beside z, batch ``[*B]``; every row gets a z of its
-                own, so that of an observation expanded to candidates these differ.
-            latent_clip: bound on each dimension of z, ``None`` for none.
+            tensordict: observation and action, batch ``[*B]``.
+
+        Returns:
+            the same with ``action_latent_loc`` and ``action_latent_scale``, ``(*B, latent_dim)``.
+
+        Raises:
+            BMRLError: if they do not fit the encoder, or the generator has no latent.
         """
-        latent = sample_action_latent(
-            (*observation.batch_size, self.generator.latent_dim),
-            latent_clip=latent_clip,
-            device=self.action_low.device,
-            dtype=self.action_low.dtype,
-        )
-        return self.decode(observation, latent)
+        return self._with_latent("encode", tensordict)
+
+    def _with_latent(self, method: str, data: TensorDictBase) -> TensorDictBase:
+        if not hasattr(self.generator, method):
+            raise BMRLError(
+                f"generator {type(self.generator).__name__} has no {method}(); valid: a generator "
+                "with a latent, such as torchrl_bmrl.modules.ActionVAE"
+            )
+        with holding(self.generator, self.weights("generator", frozen=True)):
+            return self._ask(getattr(self.generator, method), data)
+
+    def _ask(self, method: Any, data: TensorDictBase, *args: Any, **options: Any) -> Any:
+        """Calls a method of the generator, which holds its parameters."""
+        if torch.compiler.is_compiling():
+            return method(data, *args, self.tensor_keys, **options)
+        try:
+            return method(data, *args, self.tensor_keys, **options)
+        except torch.OutOfMemoryError:
+            raise
+        except (RuntimeError, KeyError) as error:
+            reads_action = method.__name__ in ("row_loss", "encode")
+            reader = getattr(self.generator, "encoder", None) if reads_action else None
+            raise unfit(reader or self.generator, data, error) from error
 
     def perturb(self, tensordict: TensorDictBase, *, target: bool = False) -> TensorDictBase:
         """Moves the action by the perturbation network, if there is one.
@@ -219,42 +306,26 @@ class GenerativeLoss(OfflineLoss):
     # -- loss ------------------------------------------------------------------------------------
 
     def generator_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        r"""Variational autoencoder's loss; gradients reach the generator alone.
-
-        .. math:: \lVert G(s, z) - a \rVert^2 / |a|
-            + \beta\, \mathrm{KL}(q(z|s,a)\,\|\,N(0, I)) / |z|,\quad z \sim q(z|s,a)
-
-        With ``kl_reduction="sum"`` the divergence is not divided by :math:`|z|`.
+        """The generator's own loss, such as :meth:`.Autoencoder.row_loss`; nothing else learns.
 
         Returns:
-            the loss and, detached, ``reconstruction_error`` and ``kl_divergence``.
+            the loss and, detached, the generator's metrics: of an autoencoder
+            ``reconstruction_error`` and ``kl_divergence``.
 
         Raises:
             BMRLError: for data with missing keys, other shapes or, on CPU and not compiled, numbers
-                that are not finite.
+                that are not finite or actions outside the bounds.
         """
-        keys = self.tensor_keys
-        data = self.rows(
-            tensordict,
-            dict.fromkeys([*self.generator.encoder.in_keys, *self.observation_keys, keys.action]),
-        )
-        action = data.get(keys.action)
+        action = self.tensor_keys.action
+        keys = [*self._training_keys, *self.observation_keys, action]
+        data = self.rows(tensordict, dict.fromkeys(keys))
+        valid = self.valid_rows(tensordict, data.batch_size)
+        check_within(action, data.get(action), self.action_low, self.action_high, valid)
         with holding(self.generator, self.weights("generator")):
-            data = read(self.generator.encoder, data)
-            loc = output(data, keys.action_latent_loc, self.generator.encoder)
-            scale = output(data, keys.action_latent_scale, self.generator.encoder)
-            data.set(keys.action_latent, loc + scale * torch.randn_like(scale))
-            reconstruction = read(self.generator.decoder, data).get(keys.action)
-        check_same_shape(keys.action, action, reconstruction)
-        error = squared_error(reconstruction, action) / action.shape[-1]
-        divergence = gaussian_kl(loc, scale)
-        divergence = divergence.sum(-1) if self.kl_reduction == "sum" else divergence.mean(-1)
-        loss = self.reduce(error + self.kl_weight * divergence, tensordict)
+            loss, metrics = self._ask(self.generator.row_loss, data, **self._options(LOSS_OPTIONS))
+        loss = self.reduce(loss, tensordict)
         self._clear_weakrefs(tensordict, data, "generator_params")
-        return loss, {
-            "reconstruction_error": error.detach().mean(),
-            "kl_divergence": divergence.detach().mean(),
-        }
+        return loss, {name: average(value, valid) for name, value in metrics.items()}
 
 
 def action_bounds(
@@ -283,7 +354,11 @@ def action_bounds(
         bounds = (action_spec.space.low, action_spec.space.high)
     # Numbers in float64: in a float64 loss 0.4 must not become 0.4 in float32.
     low, high = (
-        bound if isinstance(bound, Tensor) else torch.tensor(bound, dtype=torch.float64)
+        bound
+        if isinstance(bound, Tensor)
+        else torch.as_tensor(
+            list(bound) if isinstance(bound, Sequence) else bound, dtype=torch.float64
+        )
         for bound in bounds
     )
     if low.ndim > 1 or high.ndim > 1:

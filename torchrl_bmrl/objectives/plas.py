@@ -8,8 +8,9 @@ from tensordict.nn import TensorDictModule, dispatch
 from torch import Tensor
 from torchrl.data.tensor_specs import TensorSpec
 
+from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.functional import soft_clipped_value
-from torchrl_bmrl.objectives.checks import check_network, check_number, output
+from torchrl_bmrl.objectives.checks import check_network, output
 from torchrl_bmrl.objectives.generative import GenerativeLoss
 
 
@@ -34,7 +35,7 @@ class PLASLoss(GenerativeLoss):
     3. :meth:`actor_loss`: :math:`-Q_1(s, G(s, \pi(s)))`
 
     With a ``perturbation_network`` every decoded action :math:`a` becomes
-    :math:`a + \phi\,\xi(s, a)`, and the actor's loss trains :math:`\xi` too.
+    :math:`a + \phi\, h\, \xi(s, a)`, and the actor's loss trains :math:`\xi` too.
 
     As published, the generator is trained first, alone, and then held: call :meth:`generator_loss`
     for a while, and then the two others. The policy and the critics have targets, the generator
@@ -56,12 +57,12 @@ class PLASLoss(GenerativeLoss):
         kl_weight: β. Default 0.5, as published.
         kl_reduction: whether the divergence is the ``"mean"`` (as published) or the ``"sum"``
             over the latent's dimensions.
-        max_perturbation: φ. Default 0.05.
+        max_perturbation: φ, a share of half the action's range, in each dimension. Default 0.05.
         loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"`` (Huber) between value and target.
         gamma: discount of the default TD(0) estimator. Default 0.99.
         separate_losses: parameters that another network shares with the generator are trained by
             the generator's loss alone.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``; ``None`` is ``"mean"``.
         deactivate_vmap: run the critics in a loop and not under :func:`torch.vmap`.
         use_prioritized_weights: ``True``, ``False`` or ``"auto"``, as in TorchRL's losses.
 
@@ -117,7 +118,7 @@ class PLASLoss(GenerativeLoss):
         loss_function: str = "l2",
         gamma: float = 0.99,
         separate_losses: bool = False,
-        reduction: str = "mean",
+        reduction: str | None = "mean",
         deactivate_vmap: bool = False,
         use_prioritized_weights: str | bool = "auto",
     ) -> None:
@@ -136,8 +137,15 @@ class PLASLoss(GenerativeLoss):
             deactivate_vmap=deactivate_vmap,
             use_prioritized_weights=use_prioritized_weights,
         )
-        self.register_coefficients(lmbda=check_number("lmbda", lmbda, 0, 1))
+        for method in ("decode", "latent_dim"):
+            if not hasattr(self.generator, method):
+                raise BMRLError(
+                    f"generator {type(self.generator).__name__} has no {method!r}; valid: one with "
+                    "a latent for the policy to choose, such as torchrl_bmrl.modules.ActionVAE"
+                )
+        self.register_coefficients(high=1.0, lmbda=lmbda)
         check_network("actor_network", actor_network)
+        self.check_sizes("actor_network", actor_network)
         self.convert_to_functional(actor_network, "actor_network", create_target_params=True)
         self.convert_critics(qvalue_network, num_qvalue_nets)
         self.finish()
@@ -148,8 +156,7 @@ class PLASLoss(GenerativeLoss):
             "loss_generator",
             "loss_qvalue",
             "loss_actor",
-            "reconstruction_error",
-            "kl_divergence",
+            *self.generator_metrics,
             "pred_value",
             "target_value",
             "next_state_value",

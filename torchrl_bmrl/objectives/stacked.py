@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import dispatch
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
@@ -23,12 +24,15 @@ Self = TypeVar("Self", bound="StackedLoss")
 class StackedLoss(LossModule):
     """N losses of one kind, member i of which sees row i of the data and has parameters of its own.
 
-    It is used as one of them is: its methods ``generator_loss``, ``qvalue_loss``, ... and
-    ``forward`` take a batch ``[N, *B]`` and return what a member returns, with a first dimension of
-    N; the gradient of their sum is each member's own. ``generator_params``,
-    ``qvalue_network_params``, ... hold the parameters of all members, ``[N, ...]``, for one
-    optimizer and one :class:`~torchrl.objectives.SoftUpdate`. On a GPU the members run as one
-    program under :func:`torch.vmap`; on a CPU one after the other, where that is faster.
+    It is used as one of them is. ``forward`` takes a batch ``[N, *B]``; of members that reduce
+    their losses it returns each ``loss_*`` summed over the members, so that one ``backward()``
+    gives each member its own gradient, and every metric, ``[N]``. The methods ``generator_loss``,
+    ``qvalue_loss``, ... return the losses and metrics of each member, ``[N]``. Keys, estimators,
+    masks and coefficients are set for all members at once, ``stack.set_keys(...)``.
+    ``generator_params``, ``qvalue_network_params``, ... hold the parameters of all members,
+    ``[N, ...]``, for one optimizer and one :class:`~torchrl.objectives.SoftUpdate`. On a GPU the
+    members run as one program under :func:`torch.vmap`; on a CPU one after the other, where that
+    is faster.
 
     Args:
         losses: the members; equal in kind, networks' shapes and options, but for coefficients that
@@ -37,8 +41,8 @@ class StackedLoss(LossModule):
         names: of the members, for messages; by default their numbers.
 
     Keyword Args:
-        deactivate_vmap: run the members one after the other (``True``, needed for data with masks)
-            or under vmap (``False``); ``None`` chooses by device.
+        deactivate_vmap: run the members one after the other (``True``) or under vmap (``False``);
+            ``None`` chooses by device.
 
     Raises:
         BMRLError: for no members, members that differ, members whose networks share parameters, or
@@ -83,7 +87,7 @@ class StackedLoss(LossModule):
         self.deactivate_vmap = deactivate_vmap
         # Outside _modules: their own parameters are no state of the stack.
         self.__dict__["_losses"] = losses
-        self.__dict__["_template"] = deepcopy(losses[0])
+        template = deepcopy(losses[0])
         own = [_state(loss) for loss in losses]
         self._paths: dict[str, str] = {}
         for path in own[0]:
@@ -91,7 +95,7 @@ class StackedLoss(LossModule):
             nested = "." in path or isinstance(values[0], Tensor)
             if nested and not _trained(values[0]) and _equal(values):
                 continue  # alike in all members: the template's will do
-            if isinstance(self._template.get_submodule(path.rpartition(".")[0]), nn.ModuleList):
+            if isinstance(template.get_submodule(path.rpartition(".")[0]), nn.ModuleList):
                 raise BMRLError(f"{path!r} differs between the losses; valid: equal ones")
             name = path.replace(".", "_")
             self._paths[name] = path
@@ -99,15 +103,111 @@ class StackedLoss(LossModule):
                 self.register_buffer(name, torch.stack(values))
             else:
                 setattr(self, name, _stack(values))
+        self.__dict__["_template"] = template
         # SoftUpdate and HardUpdate note here what they move.
         self._has_update_associated = {
             name.removesuffix("_params"): False for name in self._paths if name.endswith("_params")
         }
 
+    # -- what the members have in common ---------------------------------------------------------
+
     @property
     def in_keys(self) -> list[Any]:
         """Keys that a member reads."""
         return self._template.in_keys
+
+    @in_keys.setter
+    def in_keys(self, values: list[Any]) -> None:
+        for loss in self._all():
+            loss.in_keys = values
+
+    @property
+    def out_keys(self) -> list[str]:
+        """Keys that ``forward`` returns, in order."""
+        return self._template.out_keys
+
+    @out_keys.setter
+    def out_keys(self, values: list[str]) -> None:
+        for loss in self._all():
+            loss.out_keys = values
+
+    @property
+    def tensor_keys(self) -> Any:
+        """Names of the entries, see the members' class."""
+        return self._template.tensor_keys
+
+    def set_keys(self, **kwargs: Any) -> None:
+        """Renames entries for all members.
+
+        Args:
+            **kwargs: names, see the members' class.
+        """
+        for loss in self._all():
+            loss.set_keys(**kwargs)
+
+    def make_value_estimator(self: Self, value_type: Any = None, **hyperparams: Any) -> Self:
+        """Chooses the estimator of the critics' target for all members; returns the stack itself.
+
+        Args:
+            value_type: see :meth:`.OfflineLoss.make_value_estimator`.
+            **hyperparams: of the estimator.
+        """
+        for loss in self._all():
+            loss.make_value_estimator(value_type, **hyperparams)
+        # What the members had of their own is replaced by one for all.
+        for name, path in list(self._paths.items()):
+            if path.startswith("_value_estimator."):
+                del self._paths[name]
+                delattr(self, name)
+        return self
+
+    @property
+    def value_estimator(self) -> Any:
+        """The members' estimator."""
+        return self._template.value_estimator
+
+    @property
+    def loss_mask_key(self) -> Any:
+        """Which entry marks the rows that count, see TorchRL's ``LossModule.loss_mask_key``."""
+        return self._template.loss_mask_key
+
+    @loss_mask_key.setter
+    def loss_mask_key(self, value: Any) -> None:
+        for loss in self._all():
+            loss.loss_mask_key = value
+
+    def set_vmap_randomness(self, value: str) -> None:
+        """Sets how the members draw where they run critics or teachers under vmap.
+
+        Args:
+            value: ``"error"``, ``"same"`` or ``"different"``.
+        """
+        for loss in self._all():
+            loss.set_vmap_randomness(value)
+
+    def reset_parameters_recursive(self) -> None:
+        """Initialises the parameters of every member anew."""
+        for index in range(len(self)):
+            loss = self.member(index)
+            loss.reset_parameters_recursive()
+            own = _state(loss)
+            with torch.no_grad():
+                for name, path in self._paths.items():
+                    self._held(name)[index].copy_(own[path])
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        template = self.__dict__.get("_template")
+        shared = template is not None and name in getattr(template, "_coefficients", ())
+        if not shared or isinstance(value, Tensor):
+            super().__setattr__(name, value)
+            return
+        for loss in self._all():
+            setattr(loss, name, value)
+        if name in self._buffers:  # the members have values of their own
+            self._buffers[name].fill_(getattr(template, name))
+
+    def _all(self) -> list[LossModule]:
+        return [self._template, *self._losses]
 
     def __len__(self) -> int:
         return len(self.names)
@@ -115,6 +215,10 @@ class StackedLoss(LossModule):
     def __getattr__(self, name: str) -> Any:
         if name.endswith("_loss") and hasattr(type(self._template), name):
             return partial(self._run, getattr(type(self._template), name))
+        template = self.__dict__.get("_template")
+        shared = ("gamma", *getattr(template, "_coefficients", ()))
+        if template is not None and name in shared and name not in self._buffers:
+            return getattr(template, name)
         return super().__getattr__(name)
 
     def _apply(self: Self, fn: Callable[[Tensor], Tensor]) -> Self:
@@ -137,8 +241,11 @@ class StackedLoss(LossModule):
                 own[path].copy_(self._held(name)[index])
         return loss
 
+    @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Every loss and metric of every member, each ``[N]``; see the members' class for keys.
+        """Every loss, summed over the members, and every metric of each member, ``[N]``.
+
+        With members of ``reduction="none"`` the losses are those of the rows, ``[N, *B]``.
 
         Raises:
             BMRLError: for data without a row per member, or that do not fit the members.
@@ -152,6 +259,11 @@ class StackedLoss(LossModule):
         losses, written = self._run(run, tensordict)
         if written is not None:
             tensordict.set(priority, written)
+        if self._template.reduction != "none":
+            losses = {
+                name: value.sum() if name.startswith("loss_") else value
+                for name, value in losses.items()
+            }
         return TensorDict(losses, batch_size=[])
 
     def _run(self, function: Callable[..., Any], tensordict: TensorDictBase) -> Any:
@@ -201,12 +313,10 @@ class StackedLoss(LossModule):
                 held.append((owner, attribute))
                 # Found before the module's own, which stay where they are.
                 owner.__dict__[attribute] = value
-            template.__dict__["_cache_leaves"] = {}
             yield template
         finally:
             for owner, attribute in held:
                 owner.__dict__.pop(attribute, None)
-            template.__dict__["_cache_leaves"] = {}
 
 
 def _state(loss: LossModule) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import cast
+from typing import Any, cast
 from weakref import WeakKeyDictionary
 
 import torch
@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+_PATHS: WeakKeyDictionary[nn.Module, list[tuple[str, ...]]] = WeakKeyDictionary()
 _SLOTS: WeakKeyDictionary[nn.Module, list[tuple[dict[str, Tensor], str]]] = WeakKeyDictionary()
 
 
@@ -42,18 +43,23 @@ def holding(module: nn.Module, params: TensorDictBase | list[Tensor]) -> Iterato
         return
     slots = _slots(module)
     own = [owner[name] for owner, name in slots]
-    _fill(slots, params if isinstance(params, list) else leaves(params))
+    _fill(slots, params if isinstance(params, list) else leaves(params, module))
     try:
         yield
     finally:
         _fill(slots, own)
 
 
-def leaves(params: TensorDictBase) -> list[Tensor]:
-    """Parameters and buffers in the order of the module's tensordict."""
+def leaves(params: TensorDictBase, module: nn.Module) -> list[Tensor]:
+    """Parameters and buffers in the order of a module's own.
+
+    Args:
+        params: in the layout of ``TensorDict.from_module(module)``.
+        module: into which they belong.
+    """
     # TensorDictParams wraps each of its own methods; what it holds does not.
     params = getattr(params, "_param_td", params)
-    return list(params.values(include_nested=True, leaves_only=True))
+    return [_at(params, path) for path in _paths(module)]
 
 
 def without_gradient(params: TensorDictBase, keys: Sequence[NestedKey]) -> TensorDictBase:
@@ -67,15 +73,31 @@ def _fill(slots: Sequence[tuple[dict[str, Tensor], str]], values: Sequence[Tenso
         owner[name] = value
 
 
+def _at(params: TensorDictBase, path: tuple[str, ...]) -> Tensor:
+    """The entry at a path; read where a plain TensorDict keeps it, which ``get`` takes long for."""
+    value: Any = params
+    for part in path:
+        held = getattr(value, "_tensordict", None)
+        value = value.get(part) if held is None else held[part]
+    return value
+
+
+def _paths(module: nn.Module) -> list[tuple[str, ...]]:
+    """Where a module's parameters and buffers lie in its tensordict."""
+    _slots(module)
+    return _PATHS[module]
+
+
 def _slots(module: nn.Module) -> list[tuple[dict[str, Tensor], str]]:
     """Where a module keeps its parameters and buffers, in the order of its tensordict."""
     known = _SLOTS.get(module)
     if known is None:
-        known = []
+        known, paths = [], []
         for key in TensorDict.from_module(module).keys(include_nested=True, leaves_only=True):
             path = (key,) if isinstance(key, str) else key
             owner = module.get_submodule(".".join(path[:-1]))
             place = owner._parameters if path[-1] in owner._parameters else owner._buffers
             known.append((cast("dict[str, Tensor]", place), path[-1]))
-        _SLOTS[module] = known
+            paths.append(path)
+        _SLOTS[module], _PATHS[module] = known, paths
     return known

@@ -1,0 +1,53 @@
+"""Networks that a loss has copied: what they are used for afterwards would never learn."""
+
+from __future__ import annotations
+
+from typing import Any
+from weakref import WeakKeyDictionary
+
+from torch import nn
+
+from torchrl_bmrl.errors import BMRLError
+
+_COPIED: WeakKeyDictionary[nn.Module, str] = WeakKeyDictionary()
+
+
+def note_copied(network: nn.Module, loss: str) -> None:
+    """Notes that a loss trains a copy of a network, and not the network itself.
+
+    Args:
+        network: as the user gave it.
+        loss: name of the loss's class.
+
+    Example:
+        >>> note_copied(nn.Linear(1, 1), "BCQLoss")
+    """
+    _COPIED[network] = loss
+
+
+def check_trained(name: str, network: Any) -> None:
+    """Refuses a network that stays as it was while a loss trains its copy.
+
+    Args:
+        name: of the argument that the network was given as.
+        network: to be used.
+
+    Raises:
+        BMRLError: naming what to use in its place.
+
+    Example:
+        >>> critic = nn.Linear(1, 1)
+        >>> check_trained("qvalue_network", critic)
+        >>> note_copied(critic, "BCQLoss")
+        >>> check_trained("qvalue_network", critic)
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.BMRLError: qvalue_network was copied into a BCQLoss, which trains ...
+    """
+    loss = _COPIED.get(network)
+    if loss is not None:
+        raise BMRLError(
+            f"{name} was copied into a {loss}, which trains the copy: this one stays untrained; "
+            "valid: the policy's live(loss), which follows the loss, or frozen(loss), a copy; "
+            "extract_critic(loss) for the critic alone"
+        )
