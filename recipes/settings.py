@@ -298,7 +298,8 @@ def check_settings(config: Config) -> None:
             "collect.train_episodes"
         )
     if (only := config.only) is not None:
-        if not only or not set(only) <= set(config.tasks) or len(set(only)) < len(only):
+        unknown = [task for task in only if task not in config.tasks]
+        if not only or unknown or len(set(only)) < len(only):
             raise ConfigError(f"only is {only}; valid: some of {config.tasks}, each once")
         if config.bcq.stacked:
             raise ConfigError(f"only is {only}; valid: null with bcq.stacked, which is one program")

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from copy import deepcopy
 from functools import partial
 from typing import Any
 
@@ -242,6 +243,63 @@ def test_every_replay_draws_new_noise() -> None:
 
 def as_size(shape: tuple[Any, ...]) -> Any:
     return shape[0] if len(shape) == 1 and not isinstance(shape[0], int) else shape
+
+
+def channels_last() -> nn.Module:
+    """A convolution whose parameters lie with their channels last."""
+    torch.manual_seed(0)
+    module = nn.Sequential(nn.Conv2d(3, 4, 3), nn.ReLU(), nn.Flatten(), nn.Linear(4 * 36, 1))
+    return module.to(memory_format=torch.channels_last)
+
+
+def trained(module: nn.Module, step: Any, updates: int = 20) -> list[Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(updates):
+        images = torch.randn(16, 3, 8, 8, generator=generator)
+        step((module(images).squeeze(-1) - images.mean((1, 2, 3))).square().mean())
+    return [parameter.detach().clone() for parameter in module.parameters()]
+
+
+def test_parameters_of_another_layout_are_trained_as_by_torch_s_adam() -> None:
+    ours, theirs = channels_last(), channels_last()
+    assert not next(ours.parameters()).is_contiguous()
+    optimizer = make_adam(ours.parameters(), lr=1e-2)
+    adam = torch.optim.Adam(theirs.parameters(), lr=1e-2)
+
+    def usual(loss: Tensor) -> None:
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+
+    expected = trained(theirs, usual)
+    result = trained(ours, lambda loss: gradient_step(optimizer, loss))
+    for one, other in zip(result, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-5)
+
+
+def test_an_optimizer_goes_on_with_a_state_of_another_layout() -> None:
+    through, resumed = channels_last(), channels_last()
+    optimizer = make_adam(through.parameters(), lr=1e-2)
+    trained(through, lambda loss: gradient_step(optimizer, loss))
+    resumed.load_state_dict(through.state_dict())
+    other, state = make_adam(resumed.parameters(), lr=1e-2), deepcopy(optimizer.state_dict())
+    for held in state["state"].values():  # as a file returns it
+        held |= {name: held[name].contiguous() for name in ("exp_avg", "exp_avg_sq")}
+    load_adam(other, state)
+    results = [
+        trained(module, lambda loss, adam=adam: gradient_step(adam, loss))
+        for module, adam in ((through, optimizer), (resumed, other))
+    ]
+    for one, two in zip(*results, strict=True):
+        assert torch.equal(one, two)
+
+
+@pytest.mark.parametrize("view", [lambda x: x[:, :3], lambda x: x[:1].expand(4, 8)])
+def test_parameters_with_gaps_or_overlaps_are_refused(view: Any) -> None:
+    parameter = nn.Parameter(torch.zeros(4, 8))
+    parameter.data = view(parameter.data)
+    with pytest.raises(BMRLError, match=r"strides \(.*\); valid: one without gaps and overlaps"):
+        make_adam([parameter], lr=1e-2)
 
 
 class Waiting(TorchDispatchMode):

@@ -463,7 +463,11 @@ class DiscreteBCQPolicy(_Policy):
     @dispatch
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes ``action``."""
+        """Writes ``action``.
+
+        Raises:
+            BMRLError: if generator and critic know different numbers of actions.
+        """
         self.follow()
         tensordict = self._states(tensordict)
         data = self.qvalue_network(self.generator(tensordict.select(*self.in_keys)))

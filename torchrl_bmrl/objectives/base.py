@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import asdict
 from math import inf
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
@@ -58,6 +59,7 @@ class KeyedLoss(LossModule):
         self._coefficients: dict[str, tuple[float, float, bool]] = {}
         self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[str] | None = None
+        self._left_behind: str | None = None
         self.reduction = reduction
         self.deactivate_vmap = deactivate_vmap
         self.use_prioritized_weights = use_prioritized_weights
@@ -167,8 +169,40 @@ class KeyedLoss(LossModule):
         if self._out_keys is not None:  # construction is over
             self._in_keys = self.in_keys
 
+    def set_keys(self, **kwargs: Any) -> None:
+        """Renames entries; a network's own names stay, and are compared at the next call.
+
+        Args:
+            **kwargs: names of ``tensor_keys``; ``None`` for the default.
+        """
+        super().set_keys(**kwargs)
+        self._left_behind = None
+        for name, default in asdict(self.default_keys()).items():
+            now = getattr(self.tensor_keys, name)
+            behind = self.readers(default) if now != default else []
+            if behind:
+                self._left_behind = (
+                    f"set_keys({name}={now!r}) renames what {' and '.join(behind)} read as "
+                    f"{default!r}; valid: networks that read {now!r}, or {name}={default!r}"
+                )
+
+    def check_names(self) -> None:
+        """Refuses a network that reads an entry under a name that the loss no longer uses.
+
+        Raises:
+            BMRLError: naming the network.
+        """
+        if self._left_behind is not None:
+            raise BMRLError(self._left_behind)
+
     def readers(self, key: NestedKey) -> list[str]:
-        """Names of the networks that read a key."""
+        """Names of the networks that read a key, now or after the step.
+
+        Args:
+            key: of an entry.
+        """
+        if isinstance(key, tuple) and key[0] == "next":
+            key = unravel_key(key[1:])
         networks = [(name, x) for name, x in vars(self).items() if isinstance(x, nn.Module)]
         return [
             name

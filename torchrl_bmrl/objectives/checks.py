@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from math import inf, isfinite
 from numbers import Integral, Real
@@ -196,6 +196,8 @@ def check_within(
         )
     if not (readable(action) and readable(low)):
         return
+    if torch.maximum(low - action, action - high).amax().item() <= 0:
+        return
     slack = TOLERANCE * (high - low)
     outside = (action < low - slack) | (action > high + slack)
     if valid is not None:
@@ -228,7 +230,12 @@ def next_key(key: NestedKey) -> tuple[str, ...]:
     return ("next", key) if isinstance(key, str) else ("next", *key)
 
 
-def entry(tensordict: TensorDictBase, key: NestedKey, mask: Tensor | None = None) -> Tensor:
+def entry(
+    tensordict: TensorDictBase,
+    key: NestedKey,
+    mask: Tensor | None = None,
+    readers: Callable[[NestedKey], list[str]] | None = None,
+) -> Tensor:
     """One entry of the data, finite.
 
     On CPU a number that is not finite is refused; elsewhere that would wait for the device, and
@@ -239,6 +246,7 @@ def entry(tensordict: TensorDictBase, key: NestedKey, mask: Tensor | None = None
         key: of the entry.
         mask: which rows count, ``(*B,)``. The others may hold anything: they come back as zeros,
             so that nothing in them reaches a number or a gradient.
+        readers: of a key the networks that read it, for the message.
 
     Raises:
         BMRLError: if it is missing, or holds NaN or infinity.
@@ -249,7 +257,7 @@ def entry(tensordict: TensorDictBase, key: NestedKey, mask: Tensor | None = None
     """
     value = tensordict.get(key, None)
     if value is None:
-        raise missing(tensordict, key)
+        raise missing(tensordict, key, readers(key) if readers else ())
     if mask is not None and value.shape[: mask.ndim] == mask.shape:
         valid = mask.reshape(*mask.shape, *[1] * (value.ndim - mask.ndim))
         value = torch.where(valid, value, torch.zeros_like(value))

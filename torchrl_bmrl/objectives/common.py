@@ -500,8 +500,10 @@ class OfflineLoss(KeyedLoss):
         """The shape ``*B`` of the data, told by the action; keyword calls have no batch size.
 
         Raises:
-            BMRLError: if the data have no action, or no row.
+            BMRLError: if the data have no action, or no row, or a network reads an entry under a
+                name that the loss no longer uses.
         """
+        self.check_names()
         key = self.tensor_keys.action
         action = tensordict.get(key, None)
         if action is None:
@@ -528,9 +530,7 @@ class OfflineLoss(KeyedLoss):
         values = {}
         for key in keys:
             full = next_key(key) if after else key
-            if tensordict.get(full, None) is None:
-                raise missing(tensordict, full, self.readers(key))
-            values[key] = value = entry(tensordict, full, valid)
+            values[key] = value = entry(tensordict, full, valid, self.readers)
             if value.shape[: len(batch)] != batch:
                 raise BMRLError(
                     f"{full!r} has the shape {tuple(value.shape)}; valid: {tuple(batch)} and its "

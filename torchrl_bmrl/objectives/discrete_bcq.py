@@ -186,6 +186,7 @@ class DiscreteBCQLoss(OfflineLoss):
         Raises:
             BMRLError: if the data have no action.
         """
+        self.check_names()
         key = self.tensor_keys.action
         action = tensordict.get(key, None)
         if action is None:
@@ -227,6 +228,9 @@ class DiscreteBCQLoss(OfflineLoss):
         Args:
             tensordict: the data.
             after: whether at the next state.
+
+        Raises:
+            BMRLError: if the action's spec knows another number of actions.
         """
         data = self.rows(tensordict, self.generator.in_keys, after=after)
         logits = output(self.call("generator", data), self.tensor_keys.logits, self.generator)

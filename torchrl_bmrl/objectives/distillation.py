@@ -513,6 +513,7 @@ class MetaDistillationLoss(KeyedLoss):
         Raises:
             BMRLError: for data that do not fit, as the class says.
         """
+        self.check_names()
         if tensordict.ndim != 2 or tensordict.batch_size[0] != self.num_tasks:
             raise BMRLError(
                 f"the data's batch size is {list(tensordict.batch_size)}; valid: "
