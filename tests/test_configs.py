@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -28,7 +30,7 @@ from torchrl_bmrl import objectives
 from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
 
 pytest.importorskip("hydra")
-from hydra import compose, initialize
+from hydra import compose, initialize, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.errors import ConfigCompositionException
 from hydra.utils import instantiate
@@ -214,25 +216,15 @@ def test_a_loss_is_chosen_by_its_name_beside_those_of_torchrl(
     assert chosen == OmegaConf.structured(config_of(loss))
 
 
-def test_a_command_line_sets_options_and_networks_of_both_libraries(composer: None) -> None:
-    overrides = [
-        "+loss=bcq",
-        "loss.bounds=[-1.0,1.0]",
-        "loss.lmbda=1",
-        "loss.generator={_target_: torchrl_bmrl.modules.ActionVAE}",
-        "+loss.generator.observation_dim=3",
-        "+loss.generator.action_dim=2",
-        "+network@loss.qvalue_network=tensordict_module",
-        "+network@loss.qvalue_network.module=mlp",
-        "loss.qvalue_network.in_keys=[observation,action]",
-        "loss.qvalue_network.out_keys=[state_action_value]",
-        "loss.qvalue_network.module.in_features=5",
-        "loss.qvalue_network.module.out_features=1",
-        "loss.qvalue_network.module.depth=1",
-        "loss.qvalue_network.module.num_cells=8",
-    ]
-    loss = instantiate(compose(overrides=overrides).loss)
-    assert loss.lmbda == 1.0
+def test_the_file_that_the_page_shows_makes_a_loss_of_networks_of_both_libraries(
+    tmp_path: Path,
+) -> None:
+    page = Path(__file__).parents[1] / "docs" / "api" / "configs.md"
+    (block,) = re.findall(r"```yaml\n(.*?)```", page.read_text(), re.DOTALL)
+    (tmp_path / "config.yaml").write_text(block)
+    with initialize_config_dir(version_base="1.3", config_dir=str(tmp_path)):
+        loss = instantiate(compose("config", overrides=["loss.lmbda=1"]).loss)
+    assert (loss.gamma, loss.lmbda, loss.num_qvalue_nets) == (0.98, 1.0, 2)
     assert run(loss, DATA["BCQLoss"]())["loss_qvalue"].isfinite()
 
 
