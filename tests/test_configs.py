@@ -127,6 +127,18 @@ def config_of(name: str) -> Any:
     return getattr(configs, f"{name}Config")
 
 
+def arguments(loss: type) -> dict[str, Any]:
+    """The arguments of a loss with their defaults; ``**options`` are those of the class above."""
+    found: dict[str, Any] = {}
+    for name, parameter in inspect.signature(loss).parameters.items():
+        if parameter.kind is inspect.Parameter.VAR_KEYWORD:
+            above = arguments(loss.__mro__[1])
+            found |= {key: value for key, value in above.items() if key not in found}
+        else:
+            found[name] = MISSING if parameter.default is parameter.empty else parameter.default
+    return found
+
+
 @pytest.fixture
 def composer() -> Iterator[None]:
     with initialize(version_base="1.3", config_path=None):
@@ -140,11 +152,7 @@ def test_every_loss_has_a_configuration_and_a_name_in_the_group_of_losses() -> N
 
 @each_loss
 def test_a_configuration_has_the_arguments_of_its_loss_with_their_defaults(name: str) -> None:
-    signature = inspect.signature(getattr(objectives, name)).parameters
-    expected = {
-        key: MISSING if x.default is inspect.Parameter.empty else x.default
-        for key, x in signature.items()
-    }
+    expected = arguments(getattr(objectives, name))
     fields = dataclasses.fields(config_of(name))
     found = {x.name: x.default for x in fields if not x.name.startswith("_")}
     assert found == expected

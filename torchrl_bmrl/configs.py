@@ -1,8 +1,8 @@
 """Hydra configurations of the losses, in the form that TorchRL gives its own.
 
 Importing this module stores them in Hydra's group ``loss``, as importing
-``torchrl.trainers.algorithms.configs`` does with TorchRL's: ``bcq``, ``discrete_bcq``, ``plas``,
-``meta_distillation`` and ``stacked``. It needs hydra-core and omegaconf (extra ``[recipes]``).
+``torchrl.trainers.algorithms.configs`` does with TorchRL's. It needs hydra-core and omegaconf
+(extra ``[recipes]``).
 
 Each configuration has the arguments of its loss, with the same defaults. A network is a
 configuration of its own, under ``_target_``, or the module itself. Lists reach the loss as lists
