@@ -42,7 +42,7 @@ _NEEDS = {
         "torchrl_bmrl/experts/*",
         "torchrl_bmrl/reports/films.py",
     ],
-    "hydra": ["tests/small_runs.py"],
+    "hydra": ["tests/small_runs.py", "torchrl_bmrl/configs.py"],
     "matplotlib": ["tests/published_data.py", "torchrl_bmrl/reports/*"],
     "mujoco": ["torchrl_bmrl/reports/films.py"],
     "robosuite": [

@@ -54,5 +54,6 @@ def test_the_core_imports_without_any_extra() -> None:
     tops = {name.partition(".")[0] for name in answer["new"]}
     assert "torchrl_bmrl" in tops
     assert not tops & set(EXTRAS)
-    heavy = {"agents", "checkpoint", "envs", "evaluation", "experts", "parallel", "reports", "runs"}
+    heavy = {"agents", "checkpoint", "configs", "envs", "evaluation", "experts", "parallel"}
+    heavy |= {"reports", "runs"}
     assert not {f"torchrl_bmrl.{name}" for name in heavy} & set(answer["new"])
