@@ -76,6 +76,20 @@ def test_perturbed_action_is_moved_by_phi_and_clipped_per_dimension(
     close(result, expected)
 
 
+@pytest.mark.parametrize("largest", [0.01, 1.0, 400.0])
+def test_perturbation_has_the_published_share_of_the_largest_action(
+    largest: float, rng: np.random.Generator
+) -> None:
+    # As published: (a + phi * max_action * tanh(...)) clipped to +-max_action.
+    action, output = largest * rng.uniform(-1, 1, (1000, 3)), rng.normal(size=(1000, 3))
+    expected = np.clip(action + 0.05 * largest * np.tanh(output), -largest, largest)
+    bound = torch.tensor(largest, dtype=torch.float64)
+    perturbation = torch.as_tensor(output).tanh()
+    result = functional.perturbed_action(torch.as_tensor(action), perturbation, 0.05, -bound, bound)
+    close(result, expected)
+    assert (result.abs() == bound).double().mean() < 0.05
+
+
 @pytest.mark.parametrize("lmbda", [0.0, 0.75, 1.0])
 def test_soft_clipped_value_mixes_minimum_and_maximum(
     lmbda: float, rng: np.random.Generator

@@ -109,9 +109,7 @@ def test_a_live_policy_follows_to_another_type_and_loaded_and_replaced_parameter
 
 
 @every
-def test_weights_read_from_a_live_policy_are_the_loss_s(
-    make: Make, policy: Any, data: Any
-) -> None:
+def test_weights_read_from_a_live_policy_are_the_loss_s(make: Make, policy: Any, data: Any) -> None:
     loss = make()
     live = policy.live(loss)
     held = TensorDict.from_module(live)  # as a collector takes them, once

@@ -111,7 +111,9 @@ def critic(action_dim: int) -> TensorDictModule:
     return TensorDictModule(MLP(OBSERVATION_DIM + action_dim, 1, num_cells=[4]), **CRITIC)
 
 
-@pytest.mark.parametrize("make", [lambda: make_qvalue_network(OBSERVATION_DIM, 3), lambda: critic(3)])
+@pytest.mark.parametrize(
+    "make", [lambda: make_qvalue_network(OBSERVATION_DIM, 3), lambda: critic(3)]
+)
 @pytest.mark.parametrize("several", [False, True])
 def test_a_critic_of_another_action_is_refused_at_construction(
     make: Callable[[], TensorDictModule], several: bool
@@ -184,7 +186,9 @@ def test_a_policy_of_a_critic_that_a_loss_has_copied_is_refused() -> None:
     generator, critics = ActionVAE(*DIMS), [make_qvalue_network(*DIMS) for _ in range(2)]
     BCQPolicy(generator, critics[0])  # not yet
     BCQLoss(generator, critics, bounds=(-1.0, 1.0))
-    with refused(r"qvalue_network was copied into a BCQLoss.*valid: .*live\(loss\).*frozen\(loss\)"):
+    with refused(
+        r"qvalue_network was copied into a BCQLoss.*valid: .*live\(loss\).*frozen\(loss\)"
+    ):
         BCQPolicy(generator, critics[0])
     alone = make_qvalue_network(*DIMS)
     BCQLoss(ActionVAE(*DIMS), alone, num_qvalue_nets=1, bounds=(-1.0, 1.0))

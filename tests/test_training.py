@@ -302,6 +302,23 @@ def test_parameters_with_gaps_or_overlaps_are_refused(view: Any) -> None:
         make_adam([parameter], lr=1e-2)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"weight_decay": 0.1}, "weight_decay of the optimizer is 0.1; valid: 0"),
+        ({"amsgrad": True}, "amsgrad of the optimizer is True; valid: 0"),
+        ({"lr": 0.1}, "1 groups of parameters and lr 0.1; valid: one of make_adam"),
+    ],
+)
+def test_options_that_a_gradient_step_does_not_take_are_refused(
+    options: dict[str, Any], message: str
+) -> None:
+    parameter = nn.Parameter(torch.ones(1))
+    optimizer = torch.optim.Adam([parameter], **{"lr": torch.tensor(0.1), "fused": True, **options})
+    with pytest.raises(BMRLError, match=message):
+        gradient_step(optimizer, parameter.square())
+
+
 class Waiting(TorchDispatchMode):
     """Refuses what would make Python wait for a device."""
 

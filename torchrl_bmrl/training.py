@@ -138,9 +138,13 @@ def gradient_step(optimizer: Adam, loss: Tensor, max_norm: float | None = None) 
     Compiled, those two are programs of their own with what surrounds them in Python between.
 
     Args:
-        optimizer: of :func:`make_adam`; other options of Adam than its defaults are not read.
+        optimizer: of :func:`make_adam`.
         loss: shape ``()``, or of a :class:`~torchrl_bmrl.objectives.StackedLoss` ``[N]``.
         max_norm: bound on the norm of the gradient, of each member for itself.
+
+    Raises:
+        BMRLError: for an optimizer with several groups of parameters, or options that this step
+            does not take.
 
     Example:
         >>> weight = torch.nn.Parameter(torch.ones(1))
@@ -148,7 +152,7 @@ def gradient_step(optimizer: Adam, loss: Tensor, max_norm: float | None = None) 
         >>> weight.data
         tensor([0.9000])
     """
-    (group,) = optimizer.param_groups
+    group = _only_group(optimizer)
     params = group["params"]
     grads = torch.autograd.grad(loss.sum(), params, materialize_grads=True)
     # The fused kernel goes through memory as the parameter lies; gradients may lie otherwise.
@@ -180,6 +184,20 @@ def gradient_step(optimizer: Adam, loss: Tensor, max_norm: float | None = None) 
             maximize=False,
             **rates,
         )
+
+
+def _only_group(optimizer: Adam) -> dict[str, Any]:
+    """The optimizer's parameters and options; refuses what would be left out in silence."""
+    if len(optimizer.param_groups) != 1 or not isinstance(optimizer.param_groups[0]["lr"], Tensor):
+        raise BMRLError(
+            f"an optimizer with {len(optimizer.param_groups)} groups of parameters and lr "
+            f"{optimizer.param_groups[0]['lr']}; valid: one of make_adam"
+        )
+    (group,) = optimizer.param_groups
+    for name in ("weight_decay", "amsgrad", "maximize"):
+        if group[name]:
+            raise BMRLError(f"{name} of the optimizer is {group[name]}; valid: 0, as of make_adam")
+    return group
 
 
 def _laid_out_as(param: Tensor, value: Tensor) -> Tensor:

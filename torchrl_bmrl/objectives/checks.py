@@ -68,9 +68,13 @@ def check_value_bounds(bounds: tuple[float, float] | None) -> tuple[float, float
     """
     if bounds is None:
         return None
-    if not isinstance(bounds, Sequence) or len(bounds) != 2 or not bounds[0] < bounds[1]:
+    try:
+        low, high = map(float, bounds)
+    except (TypeError, ValueError):
+        low = high = inf
+    if not low < high:
         raise BMRLError(f"value_bounds are {bounds}; valid: (low, high) with low < high, or None")
-    return bounds[0], bounds[1]
+    return low, high
 
 
 def check_network(name: str, network: Any) -> None:
