@@ -258,18 +258,29 @@ def test_a_stack_follows_to_another_type_and_its_state_loads() -> None:
     assert_states_close(other, stack)
 
 
-def test_data_with_masks_run_in_a_loop() -> None:
-    losses = members(CASES["bcq"])
-    batch = batches(CASES["bcq"], 0)
-    mask = torch.zeros(MEMBERS, 8, dtype=torch.bool)
-    mask[:, :2] = True
-    batch["mask"] = mask
-    for loss in losses:
-        loss.loss_mask_key = "mask"
-    value, _ = StackedLoss(losses).generator_loss(batch)
-    batch["action"][:, 2:] = 0.5
-    changed, _ = StackedLoss(losses).generator_loss(batch)
-    assert value.shape == changed.shape == (MEMBERS,)
+@every
+@vmap_or_loop
+def test_masks_of_the_members_may_differ_and_hide_anything(
+    case: Case, deactivate_vmap: bool, same_noise: Callable[[int], None]
+) -> None:
+    losses, batch = members(case), batches(case, 0)
+    numbers = torch.arange(MEMBERS).view(-1, *[1] * len(case.shape))
+    mask = (torch.arange(case.batch().numel()).view(case.shape) + numbers) % 3 > 0
+    batch["collector", "mask"] = mask.unsqueeze(-1)
+    for key, value in batch.items(True, True):
+        if value.is_floating_point():
+            value[~mask] = float("nan")
+    stack = StackedLoss(losses, deactivate_vmap=deactivate_vmap)
+    for index, loss in enumerate(losses):
+        same_noise(0)
+        alone = loss(row := batch[index].clone())
+        assert (row["td_error"][~mask[index]] == 0).all()
+        assert all(value.isfinite() for value in alone.values())
+    same_noise(0)
+    result = stack(batch)
+    torch.testing.assert_close(batch["td_error"][-1], row["td_error"])
+    for key in set(alone.keys()) - {f"loss_{term}" for term in case.trains}:
+        torch.testing.assert_close(result[key][-1], alone[key])
 
 
 def differing(name: str) -> list[LossModule]:

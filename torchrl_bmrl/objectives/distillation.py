@@ -569,9 +569,11 @@ def _drawn(task_latent: Tensor, valid: Tensor | None, number: int) -> Tensor:
     num_tasks, rows, size = task_latent.shape
     if valid is None:
         return task_latent[:, torch.randint(rows, (rows, number), device=task_latent.device)]
-    # A task without a row that counts draws from all: its terms count nowhere.
-    weight = (valid | ~valid.any(-1, keepdim=True)).to(task_latent.dtype)
-    index = torch.multinomial(weight, rows * number, replacement=True)
+    # The rows that count come first; a task without one draws its first row, which counts nowhere.
+    order = (~valid).to(torch.uint8).argsort(dim=-1, stable=True)
+    count = valid.sum(-1, keepdim=True).clamp(min=1)
+    share = torch.rand(num_tasks, rows * number, device=task_latent.device)
+    index = order.gather(1, (share * count).long().clamp(max=rows - 1))
     chosen = task_latent.gather(1, index.unsqueeze(-1).expand(-1, -1, size))
     return chosen.view(num_tasks, rows, number, size)
 

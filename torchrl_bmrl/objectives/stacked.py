@@ -282,8 +282,10 @@ class StackedLoss(LossModule):
                 with self._holding(dict(zip(state, row, strict=True))) as loss:
                     results.append(function(loss, data))
             return _join(results)
+        shape = getattr(self._template, "batch_shape", lambda data: data.batch_size)
+        valid = self._template.valid_rows(tensordict, shape(tensordict))
         for key in self.in_keys:
-            entry(tensordict, key)  # under vmap no member can look for itself
+            entry(tensordict, key, valid)  # under vmap no member can look for itself
 
         def run(state: dict[str, Any], data: TensorDictBase) -> Any:
             with self._holding(state) as loss:
