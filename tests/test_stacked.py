@@ -267,7 +267,7 @@ def test_masks_of_the_members_may_differ_and_hide_anything(
     numbers = torch.arange(MEMBERS).view(-1, *[1] * len(case.shape))
     mask = (torch.arange(case.batch().numel()).view(case.shape) + numbers) % 3 > 0
     batch["collector", "mask"] = mask.unsqueeze(-1)
-    for key, value in batch.items(True, True):
+    for value in batch.values(True, True):
         if value.is_floating_point():
             value[~mask] = float("nan")
     stack = StackedLoss(losses, deactivate_vmap=deactivate_vmap)

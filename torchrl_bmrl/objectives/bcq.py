@@ -109,6 +109,8 @@ class BCQLoss(GenerativeLoss):
         >>> (losses["loss_generator"] + losses["loss_qvalue"]).backward()
     """
 
+    _schedulable_buffers = frozenset({"lmbda"})
+
     def __init__(
         self,
         generator: TensorDictModule,

@@ -327,7 +327,8 @@ def unfit(module: Any, tensordict: TensorDictBase, error: Exception) -> BMRLErro
 
 # -- sizes, said in more than one place ------------------------------------------------------------
 
-Sizes = Mapping[NestedKey, int]
+Sizes = Mapping[NestedKey, Any]
+"""Of each entry the size of its last dimension, or the shape that it has beside the rows."""
 
 
 def agreed_sizes(networks: Iterable[tuple[str, Any]]) -> dict[NestedKey, int]:
@@ -358,6 +359,11 @@ def agreed_sizes(networks: Iterable[tuple[str, Any]]) -> dict[NestedKey, int]:
     return {key: size for key, (_, size) in known.items()}
 
 
+def is_lazy(network: Any) -> bool:
+    """Whether a network has parameters that get their shapes when it first runs."""
+    return any(torch.nn.parameter.is_lazy(p) for p in network.parameters())
+
+
 def check_fit(name: str, network: TensorDictModule, sizes: Sizes) -> None:
     """Runs a network once on entries of the known sizes; a lazy one gets its parameters by it.
 
@@ -370,24 +376,11 @@ def check_fit(name: str, network: TensorDictModule, sizes: Sizes) -> None:
         sizes: of the entries.
 
     Raises:
-        BMRLError: if the network cannot read them, writes another size than a known one, or is
-            lazy and reads an entry of unknown size.
+        BMRLError: if the network cannot read them, or writes another size than a known one.
     """
-    lazy = any(torch.nn.parameter.is_lazy(p) for p in network.parameters())
-    unknown = [key for key in network.in_keys if key not in sizes]
-    if lazy and unknown:
-        raise BMRLError(
-            f"{name} has parameters without a shape and reads {unknown}, whose size is not known; "
-            f"valid: a network that has run once, {name}(data)"
-        )
-    if unknown:
+    if any(key not in sizes for key in network.in_keys):
         return
-    if lazy:
-        # On its own device, in evaluation: a run must not move the statistics of a BatchNorm.
-        training = network.training
-        with torch.no_grad():
-            _run(name, network.eval(), sizes, None)
-        network.train(training)
+    warm_up(name, network, sizes)
     try:
         copy = deepcopy(network).to("meta")
     except (NotImplementedError, RuntimeError, TypeError):
@@ -395,12 +388,39 @@ def check_fit(name: str, network: TensorDictModule, sizes: Sizes) -> None:
     _run(name, copy, sizes, "meta")
 
 
+def warm_up(name: str, network: TensorDictModule, sizes: Sizes) -> None:
+    """Gives a lazy network its parameters, by a run on zeros.
+
+    Args:
+        name: of the network, for the message.
+        network: what is run; one that is not lazy is left alone.
+        sizes: of the entries that it reads.
+
+    Raises:
+        BMRLError: if an entry's size is not known, or the network cannot read them.
+    """
+    if not is_lazy(network):
+        return
+    unknown = [key for key in network.in_keys if key not in sizes]
+    if unknown:
+        raise BMRLError(
+            f"{name} has parameters without a shape and reads {unknown}, whose size is not known; "
+            f"valid: a network that has run once, {name}(data)"
+        )
+    # In evaluation: a run must not move the statistics of a BatchNorm.
+    training = network.training
+    with torch.no_grad():
+        _run(name, network.eval(), sizes, None)
+    network.train(training)
+
+
 def _run(name: str, network: Any, sizes: Sizes, device: str | None) -> None:
     weight = next((p for p in network.parameters() if p.is_floating_point()), None)
     device = device or (None if weight is None else str(weight.device))
     dtype = None if weight is None else weight.dtype
     entries = {
-        key: torch.zeros(2, sizes[key], device=device, dtype=dtype) for key in network.in_keys
+        key: torch.zeros(2, *_shape(sizes[key]), device=device, dtype=dtype)
+        for key in network.in_keys
     }
     try:
         written = network(TensorDict(entries, [2]))
@@ -412,8 +432,12 @@ def _run(name: str, network: Any, sizes: Sizes, device: str | None) -> None:
         raise unfit(network, TensorDict(entries, [2]), error) from error
     for key in network.out_keys:
         value = written.get(key, None)
-        if value is not None and key in sizes and value.shape[-1] != sizes[key]:
+        if value is not None and key in sizes and value.shape[1:] != _shape(sizes[key]):
             raise BMRLError(
                 f"{name} writes {key!r} of the size {value.shape[-1]}; valid: {sizes[key]}, as the "
                 "other networks have it"
             )
+
+
+def _shape(size: Any) -> tuple[int, ...]:
+    return (size,) if isinstance(size, int) else tuple(size)

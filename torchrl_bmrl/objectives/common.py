@@ -31,10 +31,12 @@ from torchrl_bmrl.objectives.checks import (
     check_network,
     check_number,
     entry,
+    is_lazy,
     missing,
     next_key,
     output,
     read,
+    warm_up,
 )
 from torchrl_bmrl.objectives.ensemble import kind
 from torchrl_bmrl.objectives.swap import holding, leaves, without_gradient
@@ -127,6 +129,7 @@ class OfflineLoss(KeyedLoss):
         if loss_function not in LOSS_FUNCTIONS:
             raise UnknownNameError("loss_function", loss_function, LOSS_FUNCTIONS)
         self._gamma = check_number("gamma", gamma, 0, 1)
+        self._cold = False
         self.loss_function = loss_function
         self.separate_losses = separate_losses
 
@@ -174,10 +177,11 @@ class OfflineLoss(KeyedLoss):
         )
         owners = [id(p) for critic in critics for p in critic.parameters()]
         known = {id(p) for p in self.parameters()}
-        # Stacking makes new parameters and keeps one structure, so critics that differ, or share
-        # parameters with each other or another network, stay apart; of a list of one, TorchRL
-        # would make no parameters at all.
-        alike = len({kind(critic) for critic in critics}) == 1
+        # Stacking makes new parameters and keeps one structure, so critics that differ, share
+        # parameters with each other or another network, or have no shapes yet, stay apart; of a
+        # list of one, TorchRL would make no parameters at all.
+        lazy = any(map(is_lazy, critics))
+        alike = not lazy and len({kind(critic) for critic in critics}) == 1
         self._stacked = (
             alike
             and len(critics) > 1
@@ -226,6 +230,20 @@ class OfflineLoss(KeyedLoss):
         """
         others = [(key, x) for key, x in vars(self).items() if isinstance(x, nn.Module)]
         check_fit(name, network, agreed_sizes([*others, (name, network)]))
+        self._cold = self._cold or is_lazy(network)
+
+    def _warm_up(self, tensordict: TensorDictBase, batch: torch.Size) -> None:
+        """Gives lazy networks their parameters, by the sizes of the first batch."""
+        self._cold = False
+        data = {key: tensordict.get(key, None) for key in self.in_keys}
+        shapes = {key: x.shape[len(batch) :] for key, x in data.items() if x is not None}
+        latent = getattr(vars(self).get("generator"), "latent_dim", None)
+        if latent is not None:
+            shapes[getattr(self.tensor_keys, "action_latent", "action_latent")] = (latent,)
+        for name, network in vars(self).items():
+            if isinstance(network, nn.Module) and is_lazy(network):
+                for part in _parts(network):
+                    warm_up(name, part, shapes)
 
     def _reset_module_parameters(self, module_name: str, module: Any) -> None:
         """Initialises a network anew, each critic on its own, and copies it to its target."""
@@ -429,7 +447,7 @@ class OfflineLoss(KeyedLoss):
             **hyperparams,
         )
         # TorchRL keeps hyper-parameters in float32; 0.99 is another number there.
-        estimator.to(next(self.parameters()))
+        estimator.to(**self._type_and_device)
         exact = default_value_kwargs(self.value_type) | {"gamma": self._gamma} | hyperparams
         self._gamma = check_number("gamma", exact["gamma"], 0, 1)
         for name, value in exact.items():
@@ -508,6 +526,8 @@ class OfflineLoss(KeyedLoss):
         action = tensordict.get(key, None)
         if action is None:
             raise missing(tensordict, key, self.readers(key))
+        if self._cold:
+            self._warm_up(tensordict, action.shape[:-1])
         if not action.numel():
             raise BMRLError(f"{key!r} has the shape {tuple(action.shape)}; valid: one row at least")
         return action.shape[:-1]
@@ -557,6 +577,15 @@ class _Ensemble(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return torch.stack([critic(tensordict.copy()) for critic in self.critics])
+
+
+def _parts(network: Any) -> list[Any]:
+    """The networks with keys that a network consists of."""
+    critics = getattr(network, "critics", None)
+    if critics is not None:
+        return list(critics)
+    parts = [getattr(network, name, None) for name in ("encoder", "decoder")]
+    return [part for part in parts if part is not None] or [network]
 
 
 def _renewed(module: TensorDictModule, shared: Sequence[nn.Parameter]) -> TensorDictModule:

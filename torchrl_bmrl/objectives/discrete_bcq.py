@@ -115,6 +115,7 @@ class DiscreteBCQLoss(OfflineLoss):
         state_action_value: NestedKey = "chosen_action_value"
 
     default_keys = _AcceptedKeys
+    _schedulable_buffers = frozenset({"threshold", "logits_weight"})
 
     generator: TensorDictModule
     generator_params: TensorDictParams
@@ -191,9 +192,11 @@ class DiscreteBCQLoss(OfflineLoss):
         action = tensordict.get(key, None)
         if action is None:
             raise missing(tensordict, key, self.readers(key))
-        if self.action_space == "categorical" and action.ndim == max(tensordict.ndim, 1):
-            return action.shape
-        return action.shape[:-1]
+        flat = self.action_space == "categorical" and action.ndim == max(tensordict.ndim, 1)
+        batch = action.shape if flat else action.shape[:-1]
+        if self._cold:
+            self._warm_up(tensordict, batch)
+        return batch
 
     def action_index(self, tensordict: TensorDictBase, num_actions: int) -> Tensor:
         """Index of the data's action, ``(*B,)``.

@@ -30,9 +30,11 @@ from torchrl_bmrl.objectives.checks import (
     check_number,
     check_same_shape,
     entry,
+    is_lazy,
     next_key,
     output,
     read,
+    warm_up,
 )
 from torchrl_bmrl.objectives.ensemble import FrozenEnsemble
 from torchrl_bmrl.objectives.swap import holding
@@ -177,6 +179,12 @@ class MetaDistillationLoss(KeyedLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+    _schedulable_buffers = frozenset(
+        {
+            *(f"{term}_weight" for term in ("classification", "generator", "direction", "qvalue")),
+            *("latent_norm_weight", "metric_weight", "isometry_weight", "latent_clip"),
+        }
+    )
     task_encoder: TensorDictModule
     task_encoder_params: TensorDictParams
     target_task_encoder_params: TensorDictParams
@@ -271,6 +279,9 @@ class MetaDistillationLoss(KeyedLoss):
             )
         for name, module in [*students.items(), *teachers]:
             check_fit(name, module, sizes)
+        for name, module in teachers:
+            warm_up(name, module, sizes)  # a frozen copy is made of it now
+        self._cold = any(map(is_lazy, students.values()))
         _check_equal_bounds([("student_generator", student_generator), *teachers])
         for name, module in students.items():
             self.convert_to_functional(module, name, create_target_params=False)
@@ -304,6 +315,21 @@ class MetaDistillationLoss(KeyedLoss):
             isometry_weight=isometry_weight or None,
         )
         self.keep_keys()
+
+    def _warm_up(self, tensordict: TensorDictBase) -> None:
+        """Gives lazy networks their parameters, by the sizes of the first batch."""
+        self._cold = False
+        keys = self.tensor_keys
+        data = {key: tensordict.get(key, None) for key in self.in_keys}
+        shapes = {key: x.shape[2:] for key, x in data.items() if x is not None}
+        shapes |= {keys.action_latent: (self.latent_dim,)}
+        warm_up("task_encoder", self.task_encoder, shapes)
+        with torch.no_grad():
+            shapes[keys.task_latent] = self._encode(
+                self._entries(tensordict, self.task_encoder.in_keys)
+            ).shape[2:]
+        for name in ("task_classifier", "student_generator", "student_qvalue_network"):
+            warm_up(name, getattr(self, name), shapes)
 
     def read_keys(self) -> list[NestedKey]:
         """The transition that m is computed from, what the teachers read, and the task."""
@@ -514,6 +540,8 @@ class MetaDistillationLoss(KeyedLoss):
             BMRLError: for data that do not fit, as the class says.
         """
         self.check_names()
+        if self._cold:
+            self._warm_up(tensordict)
         if tensordict.ndim != 2 or tensordict.batch_size[0] != self.num_tasks:
             raise BMRLError(
                 f"the data's batch size is {list(tensordict.batch_size)}; valid: "

@@ -90,6 +90,7 @@ class GenerativeLoss(OfflineLoss):
         perturbation: NestedKey = "perturbation"
 
     default_keys = _AcceptedKeys
+    _schedulable_buffers = frozenset({"kl_weight", "latent_clip", "max_perturbation"})
     state_networks: ClassVar[tuple[str, ...]] = ("qvalue_network", "perturbation_network")
 
     generator: TensorDictModule
@@ -123,9 +124,8 @@ class GenerativeLoss(OfflineLoss):
         self.convert_to_functional(generator, "generator", create_target_params=False)
         low, high = action_bounds(action_spec, bounds, self.tensor_keys.action)
         self._check_bounds(low, high)
-        reference = next(generator.parameters())
-        self.register_buffer("action_low", low.to(reference))
-        self.register_buffer("action_high", high.to(reference))
+        self.register_buffer("action_low", low.to(**self._type_and_device))
+        self.register_buffer("action_high", high.to(**self._type_and_device))
         if perturbation_network is None:
             self.perturbation_network = None
         else:

@@ -101,6 +101,8 @@ class PLASLoss(GenerativeLoss):
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
 
+    _schedulable_buffers = frozenset({"lmbda"})
+
     def __init__(
         self,
         generator: TensorDictModule,

@@ -11,11 +11,13 @@ from typing import Any, TypeVar
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import dispatch
+from tensordict.utils import Buffer
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
+from torchrl.objectives.value import TD0Estimator
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.objectives.checks import entry
+from torchrl_bmrl.objectives.checks import entry, is_lazy
 from torchrl_bmrl.objectives.ensemble import kind
 
 Self = TypeVar("Self", bound="StackedLoss")
@@ -93,7 +95,8 @@ class StackedLoss(LossModule):
         for path in own[0]:
             values = [state[path] for state in own]
             nested = "." in path or isinstance(values[0], Tensor)
-            if nested and not _trained(values[0]) and _equal(values):
+            coefficient = path in getattr(template, "_coefficients", ())
+            if nested and not coefficient and not _trained(values[0]) and _equal(values):
                 continue  # alike in all members: the template's will do
             if isinstance(template.get_submodule(path.rpartition(".")[0]), nn.ModuleList):
                 raise BMRLError(f"{path!r} differs between the losses; valid: equal ones")
@@ -185,6 +188,42 @@ class StackedLoss(LossModule):
         for loss in self._all():
             loss.set_vmap_randomness(value)
 
+    @property
+    def vmap_randomness(self) -> str:
+        """How the members draw where they run critics or teachers under vmap."""
+        return self._template.vmap_randomness
+
+    @property
+    def value_type(self) -> Any:
+        """Kind of the members' estimator."""
+        template = self.__dict__.get("_template")
+        return None if template is None else template.value_type
+
+    @value_type.setter
+    def value_type(self, value: Any) -> None:
+        for loss in self._all() if "_template" in self.__dict__ else ():
+            loss.value_type = value
+
+    @property
+    def _value_estimator(self) -> Any:
+        template = self.__dict__.get("_template")
+        return None if template is None else template._value_estimator
+
+    @_value_estimator.setter
+    def _value_estimator(self, value: Any) -> None:
+        if "_template" in self.__dict__:
+            self._template._value_estimator = value
+
+    @property
+    def deterministic_sampling_mode(self) -> Any:
+        """Exploration type under which the members run."""
+        return self._template.deterministic_sampling_mode
+
+    @deterministic_sampling_mode.setter
+    def deterministic_sampling_mode(self, value: Any) -> None:
+        for loss in self._all():
+            loss.deterministic_sampling_mode = value
+
     def reset_parameters_recursive(self) -> None:
         """Initialises the parameters of every member anew."""
         for index in range(len(self)):
@@ -197,14 +236,21 @@ class StackedLoss(LossModule):
 
     def __setattr__(self, name: str, value: Any) -> None:
         template = self.__dict__.get("_template")
-        shared = template is not None and name in getattr(template, "_coefficients", ())
-        if not shared or isinstance(value, Tensor):
+        if template is None or name not in getattr(template, "_coefficients", ()):
             super().__setattr__(name, value)
             return
-        for loss in self._all():
-            setattr(loss, name, value)
-        if name in self._buffers:  # the members have values of their own
-            self._buffers[name].fill_(getattr(template, name))
+        each = [value] * len(self)
+        if isinstance(value, Tensor) and value.ndim == 1:
+            each = value.tolist()
+        for loss, own in zip(self._all(), [each[0], *each], strict=True):
+            setattr(loss, name, own)
+        # A coefficient that was None had no buffer, and one that is None has none.
+        self._paths.pop(name, None)
+        self._buffers.pop(name, None)
+        if value is not None:
+            self._paths[name] = name
+            # Not by register_buffer, which finds the members' under this name.
+            self._buffers[name] = torch.stack([getattr(x, name) for x in self._losses])
 
     def _all(self) -> list[LossModule]:
         return [self._template, *self._losses]
@@ -216,8 +262,7 @@ class StackedLoss(LossModule):
         if name.endswith("_loss") and hasattr(type(self._template), name):
             return partial(self._run, getattr(type(self._template), name))
         template = self.__dict__.get("_template")
-        shared = ("gamma", *getattr(template, "_coefficients", ()))
-        if template is not None and name in shared and name not in self._buffers:
+        if template is not None and name not in self._buffers and _passed_on(template, name):
             return getattr(template, name)
         return super().__getattr__(name)
 
@@ -299,7 +344,10 @@ class StackedLoss(LossModule):
 
     @property
     def in_sequence(self) -> bool:
-        """Whether the members run one after the other."""
+        """Whether the members run one after the other; only TD(0) has a program under vmap."""
+        estimator = self._template._value_estimator
+        if estimator is not None and not isinstance(estimator, TD0Estimator):
+            return True
         if self.deactivate_vmap is None:
             return next(self.parameters()).device.type == "cpu"
         return self.deactivate_vmap
@@ -319,6 +367,14 @@ class StackedLoss(LossModule):
         finally:
             for owner, attribute in held:
                 owner.__dict__.pop(attribute, None)
+
+
+def _passed_on(template: LossModule, name: str) -> bool:
+    """Whether a stack has what its members have under a name: coefficients and networks."""
+    coefficients = getattr(template, "_coefficients", ())
+    return (
+        name == "gamma" or name in coefficients or isinstance(vars(template).get(name), nn.Module)
+    )
 
 
 def _state(loss: LossModule) -> dict[str, Any]:
@@ -353,6 +409,8 @@ def _stack(values: Sequence[TensorDictBase]) -> TensorDictParams:
     for key, leaf in values[0].items(True, True):
         if leaf.requires_grad:
             stacked.set(key, nn.Parameter(stacked.get(key)))
+        elif isinstance(leaf, Buffer):
+            stacked.set(key, Buffer(stacked.get(key)))
     return TensorDictParams(stacked, no_convert="skip")
 
 
@@ -378,6 +436,8 @@ def _check_members(losses: Sequence[LossModule], names: Sequence[str]) -> None:
         raise BMRLError(
             f"{len(losses)} losses named {list(names)}; valid: at least one, each with its own name"
         )
+    if any(map(is_lazy, losses)):
+        raise BMRLError("a loss has parameters without a shape; valid: losses that have run once")
     for name, loss in zip(names, losses, strict=True):
         if _kind(loss) != _kind(losses[0]):
             raise BMRLError(
