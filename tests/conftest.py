@@ -15,6 +15,19 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
+@pytest.hookimpl(tryfirst=True)  # before the items are chosen by their marks
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks checks of torchrl_bmrl.testing, which knows no marks of this project's own."""
+    for item in items:
+        if "KeyedLossContract" in {
+            base.__name__ for base in getattr(getattr(item, "cls", None), "__mro__", ())
+        }:
+            if "compiled" in item.name:
+                item.add_marker("slow")
+            if "cuda" in item.name or "gpu" in item.name:
+                item.add_marker("gpu")
+
+
 @pytest.fixture(scope="module")
 def recipes() -> Iterator[Any]:
     """The recipes' modules, importable as they are for a script beside them."""

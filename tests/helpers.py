@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -17,10 +17,9 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torch.nn.functional import one_hot
 from torchrl.modules import MLP
-from torchrl.objectives import LossModule
 
+from torchrl_bmrl.generators import Autoencoder
 from torchrl_bmrl.modules import (
     ActionVAE,
     make_decoder,
@@ -33,53 +32,20 @@ from torchrl_bmrl.modules import (
 from torchrl_bmrl.objectives import (
     BCQLoss,
     DiscreteBCQLoss,
-    GenerativeLoss,
     MetaDistillationLoss,
     PLASLoss,
 )
+from torchrl_bmrl.testing import Case, discrete_transitions, transitions
+from torchrl_bmrl.testing.measures import as_keywords as as_keywords
+from torchrl_bmrl.testing.measures import reached as reached
+from torchrl_bmrl.testing.measures import run as run
+from torchrl_bmrl.testing.measures import state as state
+from torchrl_bmrl.testing.measures import total as total
 
 OBSERVATION_DIM, ACTION_DIM, LATENT_DIM, TASK_LATENT_DIM = 3, 2, 4, 2
 NUM_ACTIONS = 3
 CELLS = (8,)
 NO_UPDATER = "ignore:No target network updater"
-
-
-def transitions(*batch: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> TensorDict:
-    """Random transitions; the first row of every batch is terminated, the second truncated."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def randn(size: int) -> Tensor:
-        return torch.randn(*batch, size, dtype=dtype, generator=generator)
-
-    row = torch.arange(batch[-1]).expand(batch).unsqueeze(-1)
-    return TensorDict(
-        {
-            "observation": randn(OBSERVATION_DIM),
-            "action": randn(ACTION_DIM).tanh(),
-            "next": {
-                "observation": randn(OBSERVATION_DIM),
-                "reward": randn(1),
-                "done": row < 2,
-                "terminated": row == 0,
-                "truncated": row == 1,
-            },
-        },
-        batch_size=batch,
-    )
-
-
-def discrete_transitions(
-    *batch: int,
-    action_space: str = "one-hot",
-    dtype: torch.dtype = torch.float64,
-    seed: int = 0,
-) -> TensorDict:
-    """Random transitions whose actions are one of ``NUM_ACTIONS``."""
-    data = transitions(*batch, dtype=dtype, seed=seed)
-    generator = torch.Generator().manual_seed(seed)
-    action = torch.randint(NUM_ACTIONS, batch, generator=generator)
-    data["action"] = one_hot(action, NUM_ACTIONS) if action_space == "one-hot" else action
-    return data
 
 
 def task_transitions(num_tasks: int, rows: int, dtype: torch.dtype = torch.float64) -> TensorDict:
@@ -90,170 +56,99 @@ def task_transitions(num_tasks: int, rows: int, dtype: torch.dtype = torch.float
     return data
 
 
-def as_keywords(data: TensorDict, keys: list[Any]) -> dict[str, Tensor]:
-    """The entries under the names of TorchRL's keyword dispatch."""
-    return {"_".join((key,) if isinstance(key, str) else key): data[key] for key in keys}
+# -- losses, small, as cases of the contract ------------------------------------------------------
+
+Q, XI, M, G = "qvalue_network", "perturbation_network", "task_encoder", "student_generator"
+ACTOR = "actor_network"
+CRITICS = {"generator": {"generator"}, "qvalue": {Q}}
+STUDENT = {
+    "classification": {M, "task_classifier"},
+    "generator": {M, G},
+    "direction": {M, G},
+    "qvalue": {M, "student_qvalue_network"},
+    "latent_norm": {M},
+}
+BOUNDS = {"bounds": (-1.0, 1.0)}
 
 
-# -- losses: every network passes through `edit` before the loss takes it --------------------------
-
-Edit = Callable[[TensorDictModule], TensorDictModule]
-
-
-def unchanged(module: TensorDictModule) -> TensorDictModule:
-    return module
-
-
-def undeclared(module: TensorDictModule) -> TensorDictModule:
+def undeclared(module: Any) -> Any:
     """The network as a user writes it: it says neither its sizes nor its bounds."""
+    if isinstance(module, ActionVAE):
+        parts = undeclared(module.encoder), undeclared(module.decoder)
+        return Autoencoder(*parts, module.latent_dim)
     return TensorDictModule(module.module, module.in_keys, module.out_keys)
 
 
-class OnTorso(nn.Module):
-    """A network that reads features of the observation; it has a parameter of its own, too."""
-
-    def __init__(self, torso: nn.Module, head: nn.Module) -> None:
-        super().__init__()
-        self.torso, self.head = torso, head
-        gain = torch.rand(OBSERVATION_DIM, dtype=next(torso.parameters()).dtype)
-        self.gain = nn.Parameter(gain)
-
-    def forward(self, observation: Tensor, *inputs: Tensor) -> Any:
-        return self.head(self.gain * self.torso(observation), *inputs)
+def undeclare(name: str, network: Any) -> Any:
+    """For ``edit`` of a case: every network :func:`undeclared`."""
+    return undeclared(network)
 
 
-class Dropped(nn.Module):
-    """A network with dropout after its output."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network, self.dropout = network, nn.Dropout(0.5)
-
-    def forward(self, *inputs: Tensor) -> Tensor:
-        return self.dropout(self.network(*inputs))
-
-
-def make_generator(dtype: torch.dtype, edit: Edit = unchanged) -> ActionVAE:
+def make_generator(dtype: torch.dtype = torch.float64) -> ActionVAE:
     """A small variational autoencoder."""
-    generator = ActionVAE(OBSERVATION_DIM, ACTION_DIM, num_cells=CELLS).to(dtype)
-    generator.encoder, generator.decoder = edit(generator.encoder), edit(generator.decoder)
-    return generator
+    return ActionVAE(OBSERVATION_DIM, ACTION_DIM, num_cells=CELLS).to(dtype)
 
 
-def make_critics(number: int, dtype: torch.dtype, edit: Edit = unchanged) -> list[TensorDictModule]:
+def make_critics(number: int, dtype: torch.dtype = torch.float64) -> list[TensorDictModule]:
     """Small critics of continuous actions."""
     dims = (OBSERVATION_DIM, ACTION_DIM)
-    return [edit(make_qvalue_network(*dims, num_cells=CELLS).to(dtype)) for _ in range(number)]
+    return [make_qvalue_network(*dims, num_cells=CELLS).to(dtype) for _ in range(number)]
 
 
-def make_perturbation(dtype: torch.dtype, edit: Edit = unchanged) -> TensorDictModule:
-    """A small perturbation network."""
-    return edit(make_perturbation_network(OBSERVATION_DIM, ACTION_DIM, num_cells=CELLS).to(dtype))
+def bcq_networks(perturbation: bool) -> dict[str, Any]:
+    dims = (OBSERVATION_DIM, ACTION_DIM)
+    networks: dict[str, Any] = {"generator": make_generator(), Q: make_critics(1)[0]}
+    if perturbation:
+        networks[XI] = make_perturbation_network(*dims, num_cells=CELLS)
+    return networks
 
 
-def with_moved_targets(loss: LossModule) -> Any:
-    """The loss, its target networks moved away from the trained ones."""
-    for name, target in loss.named_children():
-        if name.startswith("target_"):
-            for value in target.values(True, True):
-                value.data.add_(torch.randn_like(value), alpha=0.3)
-    return loss
+def bcq_case(perturbation: bool = False) -> Case:
+    trains = CRITICS | ({"perturbation": {XI}} if perturbation else {})
+    targets = (Q, XI) if perturbation else (Q,)
+    return Case(BCQLoss, partial(bcq_networks, perturbation), trains, targets, BOUNDS)
 
 
-def make_bcq_loss(
-    *,
-    perturbation: bool = False,
-    num_critics: int = 2,
-    critics: Any = None,
-    dtype: torch.dtype = torch.float64,
-    seed: int = 0,
-    edit: Edit = unchanged,
-    **options: Any,
-) -> BCQLoss:
+def make_bcq_loss(*, perturbation: bool = False, **options: Any) -> BCQLoss:
     """A small loss whose target networks differ from the trained ones."""
-    torch.manual_seed(seed)
-    loss = BCQLoss(
-        make_generator(dtype, edit),
-        make_critics(num_critics, dtype, edit) if critics is None else critics,
-        make_perturbation(dtype, edit) if perturbation else None,
-        **{"bounds": (-1.0, 1.0), **options},
-    )
-    return with_moved_targets(loss)
+    return bcq_case(perturbation).make(**options)
 
 
-def guide() -> ModuleType:
-    """The code of docs/extending.md as a module, so that what it defines can be pickled."""
-    if "extending" not in sys.modules:
-        page = Path(__file__).parents[1] / "docs" / "extending.md"
-        blocks = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
-        sys.modules["extending"] = module = ModuleType("extending")
-        exec(compile("\n".join(blocks), page.name, "exec"), vars(module))
-    return sys.modules["extending"]
+def plas_networks(perturbation: bool) -> dict[str, Any]:
+    actor = make_latent_actor(OBSERVATION_DIM, LATENT_DIM, num_cells=CELLS)
+    return bcq_networks(perturbation) | {ACTOR: actor}
 
 
-def make_emaq_loss(
-    *,
-    num_critics: int = 2,
-    critics: Any = None,
-    dtype: torch.dtype = torch.float64,
-    seed: int = 0,
-    edit: Edit = unchanged,
-    **options: Any,
-) -> GenerativeLoss:
-    """The loss that docs/extending.md builds, small, its targets apart from what is trained."""
-    build = guide().EMaQLoss  # draws random numbers when it runs for the first time
-    torch.manual_seed(seed)
-    loss = build(
-        make_generator(dtype, edit),
-        make_critics(num_critics, dtype, edit) if critics is None else critics,
-        **{"bounds": (-1.0, 1.0), **options},
-    )
-    return with_moved_targets(loss)
+def plas_case(perturbation: bool = False) -> Case:
+    trains = CRITICS | {"actor": {ACTOR, XI} if perturbation else {ACTOR}}
+    targets = (Q, ACTOR, XI) if perturbation else (Q, ACTOR)
+    return Case(PLASLoss, partial(plas_networks, perturbation), trains, targets, BOUNDS)
 
 
-def make_plas_loss(
-    *,
-    perturbation: bool = False,
-    num_critics: int = 2,
-    critics: Any = None,
-    dtype: torch.dtype = torch.float64,
-    seed: int = 0,
-    edit: Edit = unchanged,
-    **options: Any,
-) -> PLASLoss:
+def make_plas_loss(*, perturbation: bool = False, **options: Any) -> PLASLoss:
     """A small loss whose target networks differ from the trained ones."""
-    torch.manual_seed(seed)
-    loss = PLASLoss(
-        make_generator(dtype, edit),
-        edit(make_latent_actor(OBSERVATION_DIM, LATENT_DIM, num_cells=CELLS).to(dtype)),
-        make_critics(num_critics, dtype, edit) if critics is None else critics,
-        make_perturbation(dtype, edit) if perturbation else None,
-        **{"bounds": (-1.0, 1.0), **options},
-    )
-    return with_moved_targets(loss)
+    return plas_case(perturbation).make(**options)
 
 
-def make_discrete_network(out_key: str, dtype: torch.dtype) -> TensorDictModule:
+def make_discrete_network(out_key: str, dtype: torch.dtype = torch.float64) -> TensorDictModule:
     """One number per action from the observation."""
     network = MLP(OBSERVATION_DIM, NUM_ACTIONS, num_cells=list(CELLS), activation_class=nn.ReLU)
     return TensorDictModule(network.to(dtype), in_keys=["observation"], out_keys=[out_key])
 
 
-def make_discrete_bcq_loss(
-    *,
-    num_critics: int = 2,
-    critics: Any = None,
-    dtype: torch.dtype = torch.float64,
-    seed: int = 0,
-    edit: Edit = unchanged,
-    **options: Any,
-) -> DiscreteBCQLoss:
+def discrete_networks() -> dict[str, Any]:
+    return {"generator": make_discrete_network("logits"), Q: make_discrete_network("action_value")}
+
+
+def discrete_bcq_case(action_space: str = "one-hot") -> Case:
+    option = {"action_space": action_space}
+    data = partial(discrete_transitions, **option)
+    return Case(DiscreteBCQLoss, discrete_networks, CRITICS, (Q,), option, data)
+
+
+def make_discrete_bcq_loss(**options: Any) -> DiscreteBCQLoss:
     """A small loss whose target networks differ from the trained ones."""
-    torch.manual_seed(seed)
-    generator = edit(make_discrete_network("logits", dtype))
-    if critics is None:
-        critics = [edit(make_discrete_network("action_value", dtype)) for _ in range(num_critics)]
-    return with_moved_targets(DiscreteBCQLoss(generator, critics, **options))
+    return discrete_bcq_case().make(**options)
 
 
 def make_student_networks(num_tasks: int, dtype: torch.dtype) -> list[TensorDictModule]:
@@ -279,58 +174,51 @@ def make_teachers(
     )
 
 
-def make_distillation_loss(
+def distillation_networks(num_tasks: int = 3, teachers: Any = None) -> dict[str, Any]:
+    student = make_student_networks(num_tasks, torch.float64)
+    names = (M, "task_classifier", G, "student_qvalue_network")
+    generators, critics = teachers or make_teachers(num_tasks)
+    frozen = {"teacher_generators": generators, "teacher_qvalue_networks": critics}
+    return dict(zip(names, student, strict=True)) | frozen
+
+
+def distillation_case(
+    trains: dict[str, set[str]] = STUDENT,
     *,
     num_tasks: int = 3,
     teachers: Any = None,
-    dtype: torch.dtype = torch.float64,
-    seed: int = 0,
-    edit: Edit = unchanged,
     **options: Any,
-) -> MetaDistillationLoss:
-    """A small loss with teachers of its own."""
-    torch.manual_seed(seed)
-    student = make_student_networks(num_tasks, dtype)
-    generators, critics = teachers or make_teachers(num_tasks, dtype)
-    return MetaDistillationLoss(
-        *map(edit, student),
-        list(map(edit, generators)),
-        list(map(edit, critics)),
-        **{"latent_dim": LATENT_DIM, "context": "current", **options},
+) -> Case:
+    return Case(
+        MetaDistillationLoss,
+        partial(distillation_networks, num_tasks, teachers),
+        trains,
+        options={"latent_dim": LATENT_DIM, "context": "current", **options},
+        data=task_transitions,
+        shape=(3, 5),
+        need_not_fall=("latent_norm",),  # the penalty on m pays for the other terms
+        mixes_rows=options.get("context") in ("random", "set"),
     )
 
 
-# -- what a loss returns, and what it is made of ---------------------------------------------------
+def make_distillation_loss(
+    *, num_tasks: int = 3, teachers: Any = None, **options: Any
+) -> MetaDistillationLoss:
+    """A small loss with teachers of its own."""
+    return distillation_case(num_tasks=num_tasks, teachers=teachers).make(**options)
 
 
-def run(loss: LossModule, data: TensorDict, seed: int = 0) -> TensorDict:
-    """The losses for one fixed draw of everything that is random."""
-    torch.manual_seed(seed)
-    return loss(data)
+def guide(name: str = "extending") -> ModuleType:
+    """The code of a page of docs/ as a module, so that what it defines can be pickled."""
+    if name not in sys.modules:
+        page = Path(__file__).parents[1] / "docs" / f"{name}.md"
+        blocks = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+        sys.modules[name] = module = ModuleType(name)
+        exec(compile("\n".join(blocks), page.name, "exec"), vars(module))
+    return sys.modules[name]
 
 
-def total(losses: TensorDict, *terms: str) -> Tensor:
-    """Sum of the named terms, or of all."""
-    keys = [f"loss_{term}" for term in terms] or sorted(losses.keys())
-    return sum(losses[key] for key in keys if key.startswith("loss_"))
-
-
-def state(module: nn.Module) -> dict[str, Tensor]:
-    """A copy of the state_dict."""
-    return {key: value.clone() for key, value in module.state_dict().items()}
-
-
-def gradients(loss: LossModule) -> dict[str, Tensor]:
-    """Gradient of every parameter, zero for those that have none."""
-    return {
-        name: torch.zeros_like(p) if p.grad is None else p.grad.clone()
-        for name, p in loss.named_parameters()
-    }
-
-
-def reached(loss: LossModule) -> set[str]:
-    """Networks that hold a gradient other than zero."""
-    return {name.split("_params.")[0] for name, grad in gradients(loss).items() if grad.any()}
+# -- networks, watched and repeated ----------------------------------------------------------------
 
 
 def recorded(module: nn.Module) -> list[tuple[tuple[Tensor, ...], Tensor]]:

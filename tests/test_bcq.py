@@ -21,7 +21,7 @@ from helpers import (
     recorded,
     run,
     transitions,
-    undeclared,
+    undeclare,
 )
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
@@ -59,7 +59,7 @@ def expected_next_value(loss: BCQLoss, latent: Tensor, data: TensorDict) -> np.n
 def test_qvalue_loss_is_that_of_the_equations(perturbation: bool, batch: tuple[int, ...]) -> None:
     # A decoder of the user's may reach beyond the bounds, which then clip what is perturbed.
     options = {"max_perturbation": 0.4, "bounds": (-0.25, 0.25)} if perturbation else {}
-    options |= {"edit": undeclared}
+    options |= {"edit": undeclare}
     loss = make_bcq_loss(
         perturbation=perturbation, num_candidates=CANDIDATES, gamma=GAMMA, lmbda=LMBDA, **options
     )
@@ -123,7 +123,7 @@ def test_candidates_of_the_target_are_perturbed_in_every_dimension_within_the_bo
         deactivate_vmap=True,
         max_perturbation=0.4,
         bounds=(torch.tensor([-0.3, -0.2]), torch.tensor([0.1, 0.2])),
-        edit=undeclared,
+        edit=undeclare,
     )
     proposed = recorded(loss.generator.decoder.module)
     perturbations = recorded(loss.perturbation_network.module)
@@ -238,7 +238,7 @@ def test_the_sum_of_the_divergence_is_its_mean_times_the_size_of_the_latent() ->
 
 
 def test_perturbation_loss_is_minus_the_first_critic_at_the_perturbed_proposal() -> None:
-    options = {"max_perturbation": 0.4, "bounds": (-0.25, 0.25), "edit": undeclared}
+    options = {"max_perturbation": 0.4, "bounds": (-0.25, 0.25), "edit": undeclare}
     loss = make_bcq_loss(perturbation=True, **options)
     data = transitions(8)
     calls = recorded(loss.generator.decoder.module)
@@ -274,7 +274,7 @@ SPEC = Bounded(low=torch.tensor([-1.0, -2.0]), high=torch.tensor([0.5, 3.0]), sh
 
 @pytest.mark.parametrize("spec", [SPEC, Composite(action=SPEC)])
 def test_bounds_may_come_from_the_action_spec(spec: Any) -> None:
-    loss = make_bcq_loss(bounds=None, action_spec=spec, edit=undeclared)
+    loss = make_bcq_loss(bounds=None, action_spec=spec, edit=undeclare)
     assert loss.action_low.tolist() == [-1.0, -2.0]
     assert loss.action_high.tolist() == [0.5, 3.0]
     assert {"action_low", "action_high"} <= loss.state_dict().keys()

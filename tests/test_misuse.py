@@ -26,6 +26,7 @@ from helpers import (
     task_transitions,
     total,
     transitions,
+    undeclare,
     undeclared,
 )
 from tensordict import TensorDict
@@ -91,7 +92,7 @@ def test_bounds_of_another_length_than_the_action_are_refused(length: int) -> No
     bounds = (-torch.ones(length), torch.ones(length))
     with refused(f"lower bound of the action has {length} numbers; valid: a number, or 2"):
         BCQLoss(ActionVAE(*DIMS), make_qvalue_network(*DIMS), bounds=bounds)
-    loss = make_bcq_loss(bounds=bounds, edit=undeclared)
+    loss = make_bcq_loss(bounds=bounds, edit=undeclare)
     with refused(rf"'action' has the shape \(8, 2\) and the bounds \({length},\)"):
         loss(transitions(8))
 

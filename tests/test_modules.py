@@ -19,6 +19,7 @@ from helpers import (
     numpy_mlp,
     recorded,
     transitions,
+    undeclare,
     undeclared,
 )
 from tensordict import TensorDict, TensorDictBase
@@ -265,7 +266,7 @@ def test_policy_of_a_loss_acts_with_its_networks_and_first_critic(
         latent_clip=clip,
         max_perturbation=0.4,
         bounds=(torch.tensor([-0.25, -0.5]), torch.tensor([0.5, 0.75])),
-        edit=undeclared,
+        edit=undeclare,
     )
     loss.qvalue_loss(transitions(8))  # the policy of a loss in use
     policy = BCQPolicy.frozen(loss, num_candidates=20)

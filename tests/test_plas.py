@@ -19,7 +19,7 @@ from helpers import (
     run,
     state,
     transitions,
-    undeclared,
+    undeclare,
 )
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -29,7 +29,7 @@ from torchrl_bmrl.objectives import PLASLoss
 pytestmark = pytest.mark.filterwarnings(NO_UPDATER)
 GAMMA, LMBDA = 0.99, 0.75
 # Decoded actions reach beyond these bounds, so that clipping shows.
-BOUNDS = {"bounds": (-0.25, 0.25), "edit": undeclared}
+BOUNDS = {"bounds": (-0.25, 0.25), "edit": undeclare}
 PERTURBED = {"perturbation": True, "max_perturbation": 0.4, **BOUNDS}
 both = pytest.mark.parametrize("options", [{}, PERTURBED], ids=["plain", "perturbed"])
 

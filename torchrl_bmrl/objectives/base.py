@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.objectives.checks import check_number
+from torchrl_bmrl.objectives.checks import check_number, parts_of
 
 REDUCTIONS = ("mean", "sum", "none")
 
@@ -207,7 +207,7 @@ class KeyedLoss(LossModule):
         return [
             name
             for name, network in networks
-            if any(key in getattr(part, "in_keys", ()) for part in network.modules())
+            if any(key in getattr(part, "in_keys", ()) for part in parts_of(network))
         ]
 
     # -- reduction -------------------------------------------------------------------------------

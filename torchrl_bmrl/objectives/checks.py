@@ -308,9 +308,19 @@ def read(module: TensorDictModule, tensordict: TensorDictBase) -> TensorDictBase
         raise unfit(module, tensordict, error) from error
 
 
-def unfit(module: Any, tensordict: TensorDictBase, error: Exception) -> BMRLError:
-    """The error for data that a network cannot read."""
-    entries = [(key, tensordict.get(key, None)) for key in module.in_keys]
+def unfit(
+    module: Any, tensordict: TensorDictBase, error: Exception, also: Sequence[NestedKey] = ()
+) -> BMRLError:
+    """The error for data that a network cannot read.
+
+    Args:
+        module: the network.
+        tensordict: the data.
+        error: that it raised.
+        also: keys that it reads beside its ``in_keys``.
+    """
+    keys = dict.fromkeys([*module.in_keys, *also])
+    entries = [(key, tensordict.get(key, None)) for key in keys]
     seen = ", ".join(
         f"{key!r} {'missing' if x is None else f'{tuple(x.shape)} {x.dtype}'}" for key, x in entries
     )
@@ -357,6 +367,15 @@ def agreed_sizes(networks: Iterable[tuple[str, Any]]) -> dict[NestedKey, int]:
                     "size for all networks"
                 )
     return {key: size for key, (_, size) in known.items()}
+
+
+def parts_of(network: Any) -> list[Any]:
+    """The networks with keys that a generator or an ensemble consists of."""
+    critics = getattr(network, "critics", None)
+    if critics is not None:
+        return list(critics)
+    parts = [getattr(network, name, None) for name in ("encoder", "decoder")]
+    return [part for part in parts if part is not None] or [network]
 
 
 def is_lazy(network: Any) -> bool:

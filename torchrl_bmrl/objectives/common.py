@@ -35,6 +35,7 @@ from torchrl_bmrl.objectives.checks import (
     missing,
     next_key,
     output,
+    parts_of,
     read,
     warm_up,
 )
@@ -242,7 +243,7 @@ class OfflineLoss(KeyedLoss):
             shapes[getattr(self.tensor_keys, "action_latent", "action_latent")] = (latent,)
         for name, network in vars(self).items():
             if isinstance(network, nn.Module) and is_lazy(network):
-                for part in _parts(network):
+                for part in parts_of(network):
                     warm_up(name, part, shapes)
 
     def _reset_module_parameters(self, module_name: str, module: Any) -> None:
@@ -577,15 +578,6 @@ class _Ensemble(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return torch.stack([critic(tensordict.copy()) for critic in self.critics])
-
-
-def _parts(network: Any) -> list[Any]:
-    """The networks with keys that a network consists of."""
-    critics = getattr(network, "critics", None)
-    if critics is not None:
-        return list(critics)
-    parts = [getattr(network, name, None) for name in ("encoder", "decoder")]
-    return [part for part in parts if part is not None] or [network]
 
 
 def _renewed(module: TensorDictModule, shared: Sequence[nn.Parameter]) -> TensorDictModule:

@@ -278,8 +278,8 @@ class GenerativeLoss(OfflineLoss):
             raise
         except (RuntimeError, KeyError) as error:
             reads_action = method.__name__ in ("row_loss", "encode")
-            reader = getattr(self.generator, "encoder", None) if reads_action else None
-            raise unfit(reader or self.generator, data, error) from error
+            also = [self.tensor_keys.action] if reads_action else []
+            raise unfit(self.generator, data, error, also) from error
 
     def perturb(self, tensordict: TensorDictBase, *, target: bool = False) -> TensorDictBase:
         """Moves the action by the perturbation network, if there is one.

@@ -1,0 +1,20 @@
+"""The contract of a loss, for your own tests; it needs pytest (the extra ``[test]``).
+
+The core does not import this package.
+"""
+
+import pytest
+
+# Before they are imported: a failed check shows the values that it compared.
+pytest.register_assert_rewrite(f"{__name__}.contract", f"{__name__}.measures")
+
+from torchrl_bmrl.testing.case import Case, discrete_transitions, transitions  # noqa: E402
+from torchrl_bmrl.testing.contract import KeyedLossContract, OfflineLossContract  # noqa: E402
+
+__all__ = [
+    "Case",
+    "KeyedLossContract",
+    "OfflineLossContract",
+    "discrete_transitions",
+    "transitions",
+]
