@@ -45,6 +45,7 @@ _NEEDS = {
     "hydra": ["tests/small_runs.py", "torchrl_bmrl/configs.py"],
     "matplotlib": ["tests/published_data.py", "torchrl_bmrl/reports/*"],
     "mujoco": ["torchrl_bmrl/reports/films.py"],
+    "onnxscript": ["torchrl_bmrl/export.py"],
     "robosuite": [
         "torchrl_bmrl/envs/*",
         "torchrl_bmrl/evaluation/rollout.py",

@@ -1,9 +1,11 @@
 """A run's distilled policy as one small file, with a demonstration of each task and a card.
 
 python recipes/export.py run_dir=runs/mine             # after recipes/evaluate.py
+python recipes/export.py evaluate.policy=recipes/policies/sawyer.safetensors    # no run needed
 
-Writes ``policy.safetensors`` and ``policy.md`` into the run folder. The file alone is enough to
-act: ``recipes/evaluate.py evaluate.policy=policy.safetensors``.
+Writes ``policy.safetensors``, ``policy.md`` and ``policy.onnx`` into the run folder. The first file
+alone is enough to act: ``recipes/evaluate.py evaluate.policy=policy.safetensors``. The last one
+acts without this library (docs/export.md); of a file that was shipped it is all that is written.
 """
 
 from __future__ import annotations
@@ -13,16 +15,19 @@ import os
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 from pathlib import Path
+from typing import Any
 
 import hydra
 from omegaconf import DictConfig
 from settings import Config, run_recipe
+from tensordict import TensorDict
 
-from torchrl_bmrl.agents import load_student
+from torchrl_bmrl.agents import ACTION_DIM, Student, load_student
 from torchrl_bmrl.checkpoint import save_checkpoint
 from torchrl_bmrl.data.demonstrations import load_transitions
 from torchrl_bmrl.envs.transforms import ObservationStatistics
 from torchrl_bmrl.evaluation import read_results, summarise
+from torchrl_bmrl.export import export_policy
 from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.reports.tables import results_table
@@ -39,6 +44,11 @@ task.
 ```bash
 python recipes/evaluate.py evaluate.policy={name}
 ```
+
+`{stem}.onnx` acts with ONNX Runtime alone (docs/export.md). It takes `observation` as the
+environment gives it, `(B, {observation})`, `task_latent (B, {dim})`, that is m, and
+`action_latent (B, N, {latent})`, a latent for each of N candidates, 100 say, drawn from {draw}.
+It returns `action (B, {action})`.
 
 ## Data
 
@@ -68,8 +78,30 @@ held-out transitions from m.
 """
 
 
+def write_onnx(config: Config, student: Student, metadata: dict[str, Any]) -> None:
+    """Writes the policy as an ONNX file, which also says each task's point of m."""
+    path = Path(config.run_dir) / "policy.onnx"
+    policy = student.policy(
+        num_candidates=config.evaluate.num_candidates, latent_clip=metadata["latent_clip"]
+    )
+    statistics = ObservationStatistics.from_lists(metadata["statistics"])
+    example = TensorDict({"observation": statistics.loc, "task_latent": student.prototypes[0]})
+    tasks = dict(zip(metadata["tasks"], student.prototypes.tolist(), strict=True))
+    export_policy(
+        policy,
+        path,
+        example,
+        loc=statistics.loc,
+        scale=statistics.scale,
+        metadata={"tasks": tasks, "versions": metadata.get("versions")},
+    )
+    print(f"{path}: {path.stat().st_size / 2**20:.1f} MiB")
+
+
 def export(config: Config) -> None:
     """Writes the policy and its card."""
+    if config.evaluate.policy:
+        return write_onnx(config, *load_student(Path(config.evaluate.policy)))
     run_dir = Path(config.run_dir)
     student, metadata = load_student(run_dir / "distill" / "checkpoint.safetensors")
     rows = read_results(run_dir / "results.csv")
@@ -86,6 +118,7 @@ def export(config: Config) -> None:
         {"module": student.state_dict(), "demonstrations": demonstrations},
         metadata | {"preset": config.preset, "seed": config.seed, "versions": versions},
     )
+    clip = metadata["latent_clip"]
     card = CARD.format(
         preset=config.preset,
         seed=config.seed,
@@ -93,6 +126,11 @@ def export(config: Config) -> None:
         dim=student.prototypes.shape[-1],
         parameters=sum(p.numel() for p in student.parameters()),
         name=path.name,
+        stem=path.stem,
+        observation=len(statistics.loc),
+        latent=student.latent_dim,
+        action=ACTION_DIM,
+        draw="N(0, I)" if clip is None else f"N(0, I) and clipped to ±{clip:g}",
         noise=config.collect.noise,
         train=", ".join(
             f"{config.collect.train_episodes[task]} of {task.replace('_', ' ')}"
@@ -111,6 +149,7 @@ def export(config: Config) -> None:
     )
     write_atomic(path.with_suffix(".md"), card)
     print(f"{path}: {path.stat().st_size / 2**20:.1f} MiB, and its card, {path.with_suffix('.md')}")
+    write_onnx(config, student, metadata)
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="recipe")

@@ -31,6 +31,7 @@ from small_runs import (
     short_episodes,
     times,
 )
+from tensordict import TensorDict
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.evaluation import RESULT_FIELDS, read_results
@@ -200,6 +201,61 @@ def test_an_exported_policy_acts_alone_as_it_does_in_its_run(
     card = (exported / "policy.md").read_text()
     assert "1 of reach, 1 of lift" in card
     assert "| Lift | Distilled | online |" in card
+
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_an_exported_policy_has_a_file_that_acts_without_this_library(exported: Path) -> None:
+    check_onnx(exported / "policy.onnx", exported / "policy.safetensors")
+    card = (exported / "policy.md").read_text()
+    assert "`action_latent (B, N, 14)`" in card
+    assert "drawn from N(0, I) and clipped to ±0.5." in card
+
+
+@pytest.mark.slow
+def test_the_policy_of_the_repository_is_exported_without_a_run(run: Run, tmp_path: Path) -> None:
+    import export
+
+    policy = RECIPES / "policies" / "sawyer.safetensors"
+    run(tmp_path, export.export, f"evaluate.policy={policy}")
+    check_onnx(tmp_path / "policy.onnx", policy)
+    assert not (tmp_path / "policy.safetensors").exists()
+
+
+def check_onnx(path: Path, policy: Path) -> None:
+    """It acts as the policy does on its own demonstrations, up to actions of equal value."""
+    onnxruntime = pytest.importorskip("onnxruntime")
+    from torchrl_bmrl.agents import load_student
+    from torchrl_bmrl.checkpoint import load_checkpoint
+    from torchrl_bmrl.functional import sample_action_latent
+
+    student, metadata = load_student(policy)
+    acting = student.policy(num_candidates=100, latent_clip=metadata["latent_clip"])
+    loc, scale = (torch.tensor(metadata["statistics"][name]) for name in ("loc", "scale"))
+    session = onnxruntime.InferenceSession(path)
+    said = json.loads(session.get_modelmeta().custom_metadata_map["policy"])
+    state, _ = load_checkpoint(policy, kind="student")
+    for number, task in enumerate(metadata["tasks"]):
+        assert said["tasks"][task] == student.prototypes[number].tolist()
+        data = TensorDict(state["demonstrations"][task]).auto_batch_size_(1)
+        data = data.select("observation")
+        data["task_latent"] = student.prototypes[number].expand(len(data), -1)
+        torch.manual_seed(0)
+        expected = acting(data.copy())
+        torch.manual_seed(0)
+        clip = metadata["latent_clip"]
+        latent = sample_action_latent((len(data), 100, said["latent_dim"]), latent_clip=clip)
+        inputs = {
+            "observation": loc + scale * data["observation"],
+            "task_latent": data["task_latent"],
+            "action_latent": latent,
+        }
+        action = session.run(None, {key: value.numpy() for key, value in inputs.items()})[0]
+        found = data.copy().set("action", torch.from_numpy(action))
+        alike = (found["action"] - expected["action"]).abs().amax(-1) < 1e-4
+        assert alike.float().mean() > 0.9
+        best, value = (student.qvalue_network(of)["state_action_value"] for of in (expected, found))
+        torch.testing.assert_close(value, best, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.robosuite

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import inspect
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -22,6 +23,25 @@ if TYPE_CHECKING:
     from torchrl.objectives import LossModule
 
 Self = TypeVar("Self", bound="_Policy")
+
+
+def _dispatch(forward: Callable[..., Any]) -> Callable[..., Any]:
+    """Tensordict's ``dispatch``, whose signature also says that keywords are taken.
+
+    ``torch.export`` binds a call to the signature. It takes dynamic shapes for names alone, so the
+    usual keys are among them.
+    """
+    wrapper = dispatch(forward)
+    signature = inspect.signature(wrapper)
+    named = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None)
+        for name in ("observation", "task_latent")
+    ]
+    others = inspect.Parameter("keywords", inspect.Parameter.VAR_KEYWORD)
+    wrapper.__signature__ = signature.replace(
+        parameters=[*signature.parameters.values(), *named, others]
+    )
+    return wrapper
 
 
 class _Policy(TensorDictModuleBase):
@@ -224,18 +244,31 @@ class BCQPolicy(_Policy):
             numbers |= {name: name for name in ("max_perturbation", "action_low", "action_high")}
         return policy._follows(loss, links, numbers)
 
-    @dispatch
+    @_dispatch
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action."""
         self.follow()
-        tensordict, action_key = self._states(tensordict), self.keys.action
-        proposals = _perturb(self, self.propose(tensordict.select(*self.in_keys)))
+        tensordict = self._states(tensordict)
+        proposals = self.propose(tensordict.select(*self.in_keys))
+        return tensordict.set(self.keys.action, self.choose(proposals))
+
+    def choose(self, proposals: TensorDictBase) -> Tensor:
+        """The most valuable of proposed actions, perturbed as the policy perturbs them.
+
+        Args:
+            proposals: batch ``[*B, N]`` with the state and the action, as :meth:`propose` returns
+                them; N is free.
+
+        Returns:
+            the action, ``(*B, action_dim)``.
+        """
+        proposals = _perturb(self, proposals)
         value = self.qvalue_network(proposals).get(self.state_action_value_key)
         best = value.argmax(dim=-2, keepdim=True)
-        action = proposals.get(action_key)
+        action = proposals.get(self.keys.action)
         best = best.expand(*best.shape[:-1], action.shape[-1])
-        return tensordict.set(action_key, action.gather(-2, best).squeeze(-2))
+        return action.gather(-2, best).squeeze(-2)
 
     def propose(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The proposals among which the policy chooses, before they are perturbed.
@@ -355,7 +388,7 @@ class PLASPolicy(_Policy):
         names = ("max_perturbation", "action_low", "action_high")
         return policy._follows(loss, links, {name: name for name in names})
 
-    @dispatch
+    @_dispatch
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes ``action``."""
@@ -460,7 +493,7 @@ class DiscreteBCQPolicy(_Policy):
         )
         return policy._follows(loss, links, {"threshold": "threshold"}) if live else policy
 
-    @dispatch
+    @_dispatch
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes ``action``.
