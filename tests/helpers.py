@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
 from torchrl.modules import MLP
@@ -30,9 +31,11 @@ from torchrl_bmrl.modules import (
     make_task_classifier,
     make_task_encoder,
 )
+from torchrl_bmrl.modules.generator import make_mlp
 from torchrl_bmrl.objectives import (
     BCQLoss,
     DiscreteBCQLoss,
+    FQELoss,
     GenerativeLoss,
     MetaDistillationLoss,
     PLASLoss,
@@ -249,6 +252,35 @@ def make_discrete_bcq_loss(
     if critics is None:
         critics = [edit(make_discrete_network("action_value", dtype)) for _ in range(num_critics)]
     return with_moved_targets(DiscreteBCQLoss(generator, critics, **options))
+
+
+def make_policy(
+    dtype: torch.dtype, in_key: NestedKey = "observation", out_key: NestedKey = "action"
+) -> TensorDictModule:
+    """A small deterministic policy."""
+    network = nn.Sequential(make_mlp(OBSERVATION_DIM, ACTION_DIM, CELLS), nn.Tanh()).to(dtype)
+    return TensorDictModule(network, in_keys=[in_key], out_keys=[out_key])
+
+
+def make_fqe_loss(
+    *,
+    policy: Any = None,
+    num_critics: int = 2,
+    critics: Any = None,
+    dtype: torch.dtype = torch.float64,
+    seed: int = 0,
+    edit: Edit = unchanged,
+    **options: Any,
+) -> FQELoss:
+    """A small loss whose target networks differ from the trained ones; the policy is not edited."""
+    torch.manual_seed(seed)
+    if critics is None:
+        critics = make_critics(num_critics, dtype, edit)
+    if policy is None:
+        # Under the keys of the edited critics.
+        first = critics[0] if isinstance(critics, list) and critics else critics
+        policy = make_policy(dtype, *(first.in_keys if first else []))
+    return with_moved_targets(FQELoss(policy, critics, **options))
 
 
 def make_student_networks(num_tasks: int, dtype: torch.dtype) -> list[TensorDictModule]:
