@@ -35,6 +35,7 @@ from helpers import (
     make_discrete_bcq_loss,
     make_distillation_loss,
     make_emaq_loss,
+    make_fqe_loss,
     make_plas_loss,
     reached,
     run,
@@ -124,6 +125,7 @@ CASES = {
     "emaq_of_the_guide": offline(make_emaq_loss, transitions),
     "discrete_bcq": offline(*DISCRETE),
     "discrete_bcq_categorical": offline(*(partial(f, **CATEGORICAL) for f in DISCRETE)),
+    "fqe": Case(make_fqe_loss, transitions, {"qvalue": {Q}}, (Q,)),
     "distillation": student(context="current"),
     "distillation_previous": student(context="previous"),
     "distillation_random": student(context="random"),
@@ -132,7 +134,9 @@ CASES = {
 OFFLINE = {name: case for name, case in CASES.items() if case.offline}
 STUDENTS = {name: case for name, case in CASES.items() if not case.offline}
 every = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+GENERATIVE = {name: case for name, case in OFFLINE.items() if "generator" in case.trains}
 every_offline = pytest.mark.parametrize("case", OFFLINE.values(), ids=OFFLINE)
+every_generative = pytest.mark.parametrize("case", GENERATIVE.values(), ids=GENERATIVE)
 every_student = pytest.mark.parametrize("case", STUDENTS.values(), ids=STUDENTS)
 VALUES = ("state_action_value", "action_value")  # what critics write
 
@@ -469,7 +473,7 @@ def on_torso(
     return case.make(edit=edit, **options), torso, networks
 
 
-@every_offline
+@every_generative
 @pytest.mark.parametrize("separate", [True, False])
 def test_separate_losses_leave_a_shared_torso_to_the_generator(case: Case, separate: bool) -> None:
     loss, torso, _ = on_torso(case, separate_losses=separate)
