@@ -168,9 +168,8 @@ def make_table(rows: Rows, tasks: Sequence[str]) -> Table:
         series = [[row for row in mine if row["task"] == task] for task in names]
         chosen = [max(part, key=lambda row: row["estimate"]) for part in series]
         best = [max(row["return"] for row in part) for part in series]
-        worst = [min(row["return"] for row in part) for part in series]
         last = [part[-1]["return"] for part in series]
-        means = (np.mean(x) for x in (worst, best, last, [row["return"] for row in chosen]))
+        means = (np.mean(x) for x in (returns, best, last, [row["return"] for row in chosen]))
         picked = str(chosen[0]["updates"]) if len(names) == 1 else ""
         return name, str(found), *(f"{mean:.1f}" for mean in means), picked
 
@@ -181,10 +180,10 @@ def make_table(rows: Rows, tasks: Sequence[str]) -> Table:
             f"Of each task the agents of stage 1 after {series} updates. Rank correlation: "
             "Spearman's, between the estimates from the demonstrations and the mean returns on the "
             "evaluation's starts, with a 95% bootstrap interval over the agents; for all tasks the "
-            "mean of the tasks'. Then the mean return of the worst, the best and the last agent, "
-            "of the one with the highest estimate, and the updates that this one had."
+            "mean of the tasks'. Then the mean return of all agents, of the best and the last one, "
+            "and of the one with the highest estimate, which had so many updates."
         ),
-        header=("Task", "Rank correlation", "Worst", "Best", "Last", "Chosen", "Chosen after"),
+        header=("Task", "Rank correlation", "Mean", "Best", "Last", "Chosen", "Chosen after"),
         rows=[
             *(line(task_name(task), [task]) for task in tasks),
             *([line("All", tasks)] if len(tasks) > 1 else []),

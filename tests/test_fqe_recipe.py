@@ -106,7 +106,7 @@ def test_the_table_tells_the_agent_that_would_be_chosen(recipes: Any) -> None:
     pytest.importorskip("robosuite", exc_type=ImportError)
     import fqe
 
-    numbers = {"reach": ([1, 3, 2], [10, 30, 20]), "lift": ([3, 1, 2], [10, 30, 20])}
+    numbers = {"reach": ([1, 3, 2], [10, 45, 20]), "lift": ([3, 1, 2], [10, 45, 20])}
     rows = [
         {"task": task, "updates": updates, "estimate": estimate, "return": value, "success": 0.0}
         for task, parts in numbers.items()
@@ -115,9 +115,9 @@ def test_the_table_tells_the_agent_that_would_be_chosen(recipes: Any) -> None:
     table = fqe.make_table(rows, ["reach", "lift"])
     found = [(line[0], line[1].split()[0], *line[2:]) for line in table.rows]
     assert found == [
-        ("Reach", "1.00", "10.0", "30.0", "20.0", "30.0", "10"),
-        ("Lift", "-1.00", "10.0", "30.0", "20.0", "10.0", "5"),
-        ("All", "0.00", "10.0", "30.0", "20.0", "20.0", ""),
+        ("Reach", "1.00", "25.0", "45.0", "20.0", "45.0", "10"),
+        ("Lift", "-1.00", "25.0", "45.0", "20.0", "10.0", "5"),
+        ("All", "0.00", "25.0", "45.0", "20.0", "27.5", ""),
     ]
 
 
