@@ -157,6 +157,16 @@ class LatentSACSettings:
 
 
 @dataclass
+class FQESettings:
+    """Fitted Q evaluation of agents of stage 1, beside their true returns (fqe.py)."""
+
+    checkpoints: list[int] = field(default_factory=lambda: [100, 250, 500, 1000, 2000, 4000])
+    updates: int = 3000  # of each evaluation
+    tau: float = 0.1  # of its target: bcq.tau would take twenty times as many to reach a value
+    num_candidates: int = 10  # of the policies that are evaluated
+
+
+@dataclass
 class BaselineSettings:
     """Other offline algorithms on the same demonstrations (baselines.py)."""
 
@@ -193,6 +203,7 @@ class Config:
     imitate: ImitateSettings = field(default_factory=ImitateSettings)
     interpolation: InterpolationSettings = field(default_factory=InterpolationSettings)
     latent_sac: LatentSACSettings = field(default_factory=LatentSACSettings)
+    fqe: FQESettings = field(default_factory=FQESettings)
     baselines: BaselineSettings = field(default_factory=BaselineSettings)
 
 
@@ -227,6 +238,10 @@ POSITIVE = (
     "latent_sac.environment_steps",
     "latent_sac.eval_interval",
     "latent_sac.eval_episodes",
+    "fqe.checkpoints",
+    "fqe.updates",
+    "fqe.tau",
+    "fqe.num_candidates",
     "collect.valid_episodes",
     "collect.gains.position",
     "collect.gains.grasp_position",
@@ -262,6 +277,7 @@ SHARES = (
     "bcq.lmbda",
     "bcq.gamma",
     "bcq.tau",
+    "fqe.tau",
     "distill.context_fraction",
     "human.shares",
 )
@@ -357,6 +373,9 @@ def check_settings(config: Config) -> None:
         raise ConfigError(f"latent_sac.seeds is {seeds}; valid: at least one, each once")
     if steps > config.latent_sac.environment_steps:
         raise ConfigError(f"latent_sac.random_steps is {steps}; valid: 0 to environment_steps")
+    series = config.fqe.checkpoints
+    if len(series) < 2 or series != sorted(set(series)):
+        raise ConfigError(f"fqe.checkpoints is {series}; valid: at least two, from low to high")
     names = config.baselines.algorithms
     for name in names:
         if name not in BASELINES:

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
@@ -29,9 +30,11 @@ from torchrl_bmrl.modules import (
     make_task_classifier,
     make_task_encoder,
 )
+from torchrl_bmrl.modules.generator import make_mlp
 from torchrl_bmrl.objectives import (
     BCQLoss,
     DiscreteBCQLoss,
+    FQELoss,
     MetaDistillationLoss,
     PLASLoss,
 )
@@ -149,6 +152,33 @@ def discrete_bcq_case(action_space: str = "one-hot") -> Case:
 def make_discrete_bcq_loss(**options: Any) -> DiscreteBCQLoss:
     """A small loss whose target networks differ from the trained ones."""
     return discrete_bcq_case().make(**options)
+
+
+def make_policy(
+    dtype: torch.dtype, in_key: NestedKey = "observation", out_key: NestedKey = "action"
+) -> TensorDictModule:
+    """A small deterministic policy."""
+    network = nn.Sequential(make_mlp(OBSERVATION_DIM, ACTION_DIM, CELLS), nn.Tanh()).to(dtype)
+    return TensorDictModule(network, in_keys=[in_key], out_keys=[out_key])
+
+
+def evaluate_a_policy(qvalue_network: Any, policy: Any = None, **options: Any) -> FQELoss:
+    """The loss with a policy under the keys of the critics: it is trained by nobody."""
+    if policy is None:
+        several = isinstance(qvalue_network, list)
+        first = next(iter(qvalue_network), None) if several else qvalue_network
+        weight = torch.zeros(()) if first is None else next(first.parameters())
+        policy = make_policy(weight.dtype, *(first.in_keys if first else []))
+    return FQELoss(policy, qvalue_network, **options)
+
+
+def fqe_case() -> Case:
+    return Case(evaluate_a_policy, lambda: {Q: make_critics(1)[0]}, {"qvalue": {Q}}, (Q,))
+
+
+def make_fqe_loss(**options: Any) -> FQELoss:
+    """A small loss whose target networks differ from the trained ones; the policy is not edited."""
+    return fqe_case().make(**options)
 
 
 def make_student_networks(num_tasks: int, dtype: torch.dtype) -> list[TensorDictModule]:

@@ -46,6 +46,7 @@ LOSSES = sorted(set(objectives.__all__) - BASES)
 GROUP = {
     "bcq": "BCQLoss",
     "discrete_bcq": "DiscreteBCQLoss",
+    "fqe": "FQELoss",
     "meta_distillation": "MetaDistillationLoss",
     "plas": "PLASLoss",
     "stacked": "StackedLoss",
@@ -75,6 +76,10 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "DiscreteBCQLoss": {
         "generator": torchrl(["observation"], "logits", OBSERVATION_DIM, NUM_ACTIONS),
         "qvalue_network": torchrl(["observation"], "action_value", OBSERVATION_DIM, NUM_ACTIONS),
+    },
+    "FQELoss": {
+        "policy": torchrl(["observation"], "action", OBSERVATION_DIM, ACTION_DIM),
+        "qvalue_network": [CRITIC, TORCHRL_CRITIC],
     },
     "MetaDistillationLoss": {
         "task_encoder": ours("make_task_encoder", **SIZES, **STUDENT),
@@ -115,6 +120,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
 DATA = {
     "BCQLoss": lambda: transitions(4, dtype=torch.float32),
     "DiscreteBCQLoss": lambda: discrete_transitions(4, dtype=torch.float32),
+    "FQELoss": lambda: transitions(4, dtype=torch.float32),
     "MetaDistillationLoss": lambda: task_transitions(2, 4, dtype=torch.float32),
     "PLASLoss": lambda: transitions(4, dtype=torch.float32),
     "StackedLoss": lambda: transitions(2, 4, dtype=torch.float32),

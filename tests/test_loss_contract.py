@@ -24,6 +24,7 @@ from helpers import (
     bcq_case,
     discrete_bcq_case,
     distillation_case,
+    fqe_case,
     guide,
     plas_case,
 )
@@ -46,6 +47,7 @@ OFFLINE = {
     "rebrac_of_the_guide": guide().TestReBRACLoss.case,
     "discrete_bcq": discrete_bcq_case(),
     "discrete_bcq_categorical": discrete_bcq_case("categorical"),
+    "fqe": fqe_case(),
 }
 STUDENTS = {
     "distillation": distillation_case(context="current"),

@@ -12,6 +12,7 @@ from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.evaluation.statistics import (
     bootstrap_interval,
     probability_of_improvement,
+    rank_correlation,
     relative_difference,
 )
 
@@ -245,3 +246,53 @@ def test_strata_of_one_episode_stay_what_they_are() -> None:
 def test_what_cannot_be_compared_is_named(call: Callable[[], object], message: str) -> None:
     with pytest.raises(BMRLError, match=message):
         call()
+
+
+# Whether one measure orders as another does
+
+
+def test_rank_correlation_is_spearmans_with_ties_as_scipy_has_it() -> None:
+    from scipy.stats import spearmanr
+
+    rng = np.random.default_rng(0)
+    x, y = rng.integers(0, 6, 30), rng.integers(0, 6, 30)
+    assert rank_correlation(x, y).value == pytest.approx(spearmanr(x, y).statistic, abs=1e-12)
+
+
+def test_only_the_order_counts_in_a_rank_correlation() -> None:
+    x = np.random.default_rng(1).normal(size=8)
+    assert rank_correlation(x, np.exp(5 * x)).value == pytest.approx(1.0)
+    assert rank_correlation(x, -(x**3)).value == pytest.approx(-1.0)
+
+
+def test_ranks_are_those_within_a_group_and_groups_count_alike() -> None:
+    x = [1.0, 2.0, 3.0, 101.0, 102.0]
+    y = [30.0, 20.0, 10.0, 1.0, 2.0]
+    assert rank_correlation(x, y, groups=[0, 0, 0, 1, 1]).value == pytest.approx(0.0)
+    assert rank_correlation(x, y).value == pytest.approx(-0.9)
+
+
+def test_a_measure_without_order_counts_as_no_correlation() -> None:
+    estimate = rank_correlation([1.0, 1.0, 1.0], [1.0, 2.0, 3.0])
+    assert (estimate.value, estimate.low, estimate.high) == (0.0, 0.0, 0.0)
+
+
+def test_interval_of_the_rank_correlation_agrees_with_an_independent_bootstrap() -> None:
+    from scipy.stats import spearmanr
+
+    rng = np.random.default_rng(2)
+    x = rng.normal(size=24)
+    y, groups = x + rng.normal(size=24), np.repeat([0, 1], 12)
+    found = rank_correlation(x, y, groups=groups)
+    values = []
+    for _ in range(2000):
+        drawn = [rng.choice(np.flatnonzero(groups == g), 12) for g in (0, 1)]
+        values.append(float(np.mean([spearmanr(x[rows], y[rows]).statistic for rows in drawn])))
+    low, high = percentiles(values)
+    assert found.low == pytest.approx(low, abs=0.04)
+    assert found.high == pytest.approx(high, abs=0.04)
+
+
+def test_rank_correlation_names_what_is_no_pair() -> None:
+    with pytest.raises(BMRLError, match="x and y are pairs; got 2 and 3 values"):
+        rank_correlation([1.0, 2.0], [1.0, 2.0, 3.0])

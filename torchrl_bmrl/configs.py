@@ -23,6 +23,7 @@ from torchrl_bmrl.objectives.distillation import ENCODER_TERMS
 __all__ = [
     "BCQLossConfig",
     "DiscreteBCQLossConfig",
+    "FQELossConfig",
     "MetaDistillationLossConfig",
     "PLASLossConfig",
     "StackedLossConfig",
@@ -118,6 +119,41 @@ class DiscreteBCQLossConfig(LossConfig):
     deactivate_vmap: bool = False
     use_prioritized_weights: str | bool = "auto"
     _target_: str = "torchrl_bmrl.objectives.DiscreteBCQLoss"
+    _convert_: str = "all"
+
+
+@dataclass
+class FQELossConfig(LossConfig):
+    """Hydra configuration of :class:`~torchrl_bmrl.objectives.FQELoss`.
+
+    Attributes:
+        policy, qvalue_network: the policy that is evaluated, which stays as it is, and its critics,
+            or their configurations; ``qvalue_network`` may be a list of them.
+        num_qvalue_nets, gamma, loss_function, separate_losses, reduction: as in the loss.
+        deactivate_vmap, use_prioritized_weights: as in the loss.
+        _target_, _convert_, _partial_: what Hydra makes, and how.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torch.nn import Linear
+        >>> from torchrl_bmrl.modules import make_qvalue_network
+        >>> policy = TensorDictModule(Linear(3, 2), in_keys=["observation"], out_keys=["action"])
+        >>> networks = {"policy": policy, "qvalue_network": make_qvalue_network(3, 2)}
+        >>> type(instantiate(FQELossConfig(gamma=0.98), **networks)).__name__
+        'FQELoss'
+    """
+
+    policy: Any = MISSING
+    qvalue_network: Any = MISSING
+    num_qvalue_nets: int | None = None
+    gamma: float = 0.99
+    loss_function: str = "l2"
+    separate_losses: bool = False
+    reduction: str | None = "mean"
+    deactivate_vmap: bool = False
+    use_prioritized_weights: str | bool = "auto"
+    _target_: str = "torchrl_bmrl.objectives.FQELoss"
     _convert_: str = "all"
 
 
@@ -254,6 +290,7 @@ class StackedLossConfig(LossConfig):
 for _name, _config in (
     ("bcq", BCQLossConfig),
     ("discrete_bcq", DiscreteBCQLossConfig),
+    ("fqe", FQELossConfig),
     ("meta_distillation", MetaDistillationLossConfig),
     ("plas", PLASLossConfig),
     ("stacked", StackedLossConfig),

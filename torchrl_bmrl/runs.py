@@ -35,6 +35,7 @@ FREE_TO_CHANGE = (
     "imitate",
     "interpolation",
     "latent_sac",
+    "fqe",
     "baselines",
 )
 """Settings that do not change a run's result, and so may differ when it goes on.

@@ -15,6 +15,7 @@ from torchrl_bmrl.evaluation.statistics import (
     Estimate,
     bootstrap_interval,
     probability_of_improvement,
+    rank_correlation,
     relative_difference,
 )
 
@@ -26,6 +27,7 @@ __all__ = [
     "Summary",
     "bootstrap_interval",
     "probability_of_improvement",
+    "rank_correlation",
     "read_results",
     "relative_difference",
     "summarise",

@@ -1,0 +1,192 @@
+"""Fitted Q evaluation as a TorchRL loss module."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from copy import deepcopy
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.envs.utils import set_exploration_type
+
+from torchrl_bmrl.objectives.checks import check_network, entry, next_key, output
+from torchrl_bmrl.objectives.common import OfflineLoss
+from torchrl_bmrl.objectives.ensemble import kind
+
+
+class FQELoss(OfflineLoss):
+    r"""Fitted Q evaluation: what a policy would return, learned from a fixed batch.
+
+    Critics :math:`Q_j` of a policy :math:`\pi` that stays as it is. They rank policies, such as the
+    checkpoints of a training, where there is no simulator to run them in.
+
+    Reference: Le, Voloshin and Yue, *Batch Policy Learning under Constraints*, ICML 2019,
+    https://arxiv.org/abs/1903.08738, algorithm 3.
+
+    .. math::
+        L = \sum_j (Q_j(s, a) - y)^2,\quad y = r + \gamma\, (1 - \mathrm{terminated})\,
+        \frac{1}{n} \sum_j Q'_j(s', \pi(s'))
+
+    where the published algorithm fits one critic to the end before its target moves, here the
+    target moves under :class:`~torchrl.objectives.HardUpdate`, which does the same at a long
+    interval, or :class:`~torchrl.objectives.SoftUpdate`. :meth:`policy_value` is the estimate.
+
+    The policy is copied, in evaluation mode: no gradient reaches it, no optimizer finds it, and
+    later updates of the given one do not reach the copy. ``state_dict()`` holds it under
+    ``policy_params``. A policy that draws, such as :class:`~torchrl_bmrl.modules.BCQPolicy`, draws
+    anew at every call; a probabilistic module of TorchRL acts by its mode, as in every loss, unless
+    ``deterministic_sampling_mode`` says otherwise.
+
+    Args:
+        policy: any module that writes the action, such as
+            :class:`~torchrl_bmrl.modules.BCQPolicy`, :class:`~torchrl_bmrl.modules.PLASPolicy` or
+            :class:`~torchrl_bmrl.modules.DiscreteBCQPolicy`.
+        qvalue_network: list of critics (observation, action → ``state_action_value``), each with
+            an initialisation of its own, or one critic, of which ``num_qvalue_nets`` are made. A
+            critic of discrete actions reads them one-hot; one that writes the value of every action
+            is not accepted.
+
+    Keyword Args:
+        num_qvalue_nets: number of critics; default 1 from a single one, else the list's length.
+        **options: of :class:`~torchrl_bmrl.objectives.OfflineLoss`, such as ``gamma`` and
+            ``loss_function``; there is no generator that ``separate_losses`` could speak of.
+
+    Keys read: ``observation (*B, obs_dim)``, ``action (*B, action_dim)``, and under ``"next"``
+    ``observation``, ``reward``, ``done``, ``terminated``, each of the last three ``(*B, 1)``.
+    Key written to the input: ``td_error (*B,)``, the priority.
+
+    Raises:
+        BMRLError: for a policy that is no TensorDictModule, no critics, or an option that the base
+            refuses; and at a call for a policy that writes no action, critics that write no
+            ``state_action_value (*B, 1)``, and data with missing keys, other shapes or, on CPU and
+            not compiled, numbers that are not finite.
+
+    Example:
+        >>> from torchrl_bmrl.modules import ActionVAE, PLASPolicy, make_latent_actor
+        >>> from torchrl_bmrl.modules import make_qvalue_network
+        >>> policy = PLASPolicy(make_latent_actor(3, 4), ActionVAE(3, 2).decoder)
+        >>> loss = FQELoss(policy, make_qvalue_network(3, 2), gamma=0.9)
+        >>> data = TensorDict(
+        ...     {
+        ...         "observation": torch.randn(8, 3),
+        ...         "action": torch.rand(8, 2) * 2 - 1,
+        ...         "next": {
+        ...             "observation": torch.randn(8, 3),
+        ...             "reward": torch.randn(8, 1),
+        ...             "done": torch.zeros(8, 1, dtype=torch.bool),
+        ...             "terminated": torch.zeros(8, 1, dtype=torch.bool),
+        ...         },
+        ...     },
+        ...     batch_size=[8],
+        ... )
+        >>> loss(data)["loss_qvalue"].backward()
+        >>> loss.policy_value(data[:2].select("observation")).shape
+        torch.Size([])
+    """
+
+    policy: TensorDictModuleBase
+    policy_params: TensorDictParams
+
+    def __init__(
+        self,
+        policy: TensorDictModuleBase,
+        qvalue_network: TensorDictModule | list[TensorDictModule],
+        *,
+        num_qvalue_nets: int | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        check_network("policy", policy)
+        policy = deepcopy(policy).eval()
+        params = TensorDict.from_module(policy)
+        # Buffers of the loss; the module keeps only where they belong, as TorchRL's networks do.
+        self.policy_params = TensorDictParams(params.data, no_convert=True)
+        meta = params.apply(self._make_meta_params, device=torch.device("meta"), filter_empty=False)
+        meta.to_module(policy)
+        self.__dict__["policy"] = policy
+        self.policy_kind = kind(policy)  # by which a StackedLoss tells its members apart
+        self.convert_critics(qvalue_network, num_qvalue_nets, default=1)
+        self.finish()
+
+    @property
+    def observation_keys(self) -> list[NestedKey]:
+        """What policy and critics read of a state."""
+        keys = dict.fromkeys([*self.policy.in_keys, *self.qvalue_network.in_keys])
+        return [key for key in keys if key != self.tensor_keys.action]
+
+    def read_keys(self) -> Iterable[NestedKey]:
+        """What the critics read, the action, and what followed."""
+        now = [*self.qvalue_network.in_keys, self.tensor_keys.action]
+        return [*now, *map(next_key, self.observation_keys), *self.outcome_keys]
+
+    def written_keys(self) -> list[str]:
+        """The loss, then metrics."""
+        return ["loss_qvalue", "pred_value", "target_value", "next_state_value"]
+
+    def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Critics' loss, summed over the critics; gradients reach the critics alone.
+
+        Returns:
+            the loss and, detached, ``td_error (num_qvalue_nets, *B)``, ``pred_value``,
+            ``target_value`` and ``next_state_value``.
+        """
+        with torch.no_grad():
+            after = self.rows(tensordict, self.observation_keys, after=True)
+            next_value = self.state_value(after, target=True)
+        data = self.rows(tensordict, self.qvalue_network.in_keys)
+        predicted = self.qvalue(data)
+        result = self.temporal_difference(tensordict, predicted, next_value)
+        self._clear_weakrefs(
+            tensordict, data, "qvalue_network_params", "target_qvalue_network_params"
+        )
+        return result
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Computes the loss with the present parameters; see the class for keys."""
+        loss_qvalue, info = self.qvalue_loss(tensordict)
+        tensordict.set(self.tensor_keys.priority, info.pop("td_error").amax(0))
+        return TensorDict({"loss_qvalue": loss_qvalue} | info)
+
+    # -- what the policy is worth ----------------------------------------------------------------
+
+    def state_value(self, observation: TensorDictBase, *, target: bool = False) -> Tensor:
+        r"""Value of states under the policy, :math:`\frac{1}{n} \sum_j Q_j(s, \pi(s))`, ``(*B,)``.
+
+        Args:
+            observation: what policy and critics read of a state, batch ``[*B]``.
+            target: whether with the targets' parameters.
+
+        Raises:
+            BMRLError: if the policy writes no action, or the state does not fit the networks.
+        """
+        data = self.call("policy", observation.copy(), frozen=True)
+        output(data, self.tensor_keys.action, self.policy)
+        return self.qvalue(data, target=target).mean(0)
+
+    @torch.no_grad()
+    def policy_value(self, tensordict: TensorDictBase) -> Tensor:
+        r"""Estimate of the policy's discounted return, the mean value of start states, ``()``.
+
+        .. math:: \hat J(\pi) = \mathbb{E}_{s_0} \frac{1}{n} \sum_j Q_j(s_0, \pi(s_0))
+
+        Args:
+            tensordict: start states, batch ``[*B]``, with what policy and critics read of a state.
+
+        Returns:
+            the estimate, without gradient, in the reward's unit. Where episodes are cut off and
+            not terminated it counts on as if they were not.
+
+        Raises:
+            BMRLError: for missing keys, other shapes or, on CPU and not compiled, numbers that are
+                not finite.
+        """
+        states = TensorDict({}, batch_size=tensordict.batch_size)
+        for key in self.observation_keys:
+            states.set(key, entry(tensordict, key))
+        with set_exploration_type(self.deterministic_sampling_mode):
+            return self.state_value(states).mean()
