@@ -303,8 +303,8 @@ def check_settings(settings: Settings) -> None:
         raise UnknownNameError("env", settings.env, envs)
     try:
         importlib.import_module("gymnasium.envs.mujoco")
-    except ImportError as error:  # imageio, which gymnasium itself does not require
-        raise ConfigError(f"env {settings.env} needs one more package: {error.name}") from error
+    except (ImportError, gymnasium.error.DependencyNotInstalled) as error:  # imageio, mujoco
+        raise ConfigError(f"env {settings.env} needs one more package: {error}") from error
     for name in settings.algorithms:
         if name not in ALGORITHMS:
             raise UnknownNameError("algorithm", name, ALGORITHMS)

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 
+pytest.importorskip("gymnasium")
 pytest.importorskip("h5py")
 
 import h5py

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -15,6 +16,7 @@ pytest.importorskip("mujoco")
 pytest.importorskip("safetensors")
 pytest.importorskip("tqdm")
 
+import gymnasium
 from small_runs import RECIPES, command_line, recipe
 
 from torchrl_bmrl.errors import BMRLError
@@ -94,6 +96,17 @@ def test_an_invalid_setting_is_one_line_that_says_what_is_valid(
     with pytest.raises(BMRLError, match=f"^{says}") as error:
         extrapolation.check_settings(OmegaConf.to_object(config))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "error", [ImportError("imageio"), gymnasium.error.DependencyNotInstalled("mujoco")]
+)
+def test_a_package_that_the_task_lacks_is_named(
+    extrapolation, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    monkeypatch.setattr(extrapolation.importlib, "import_module", Mock(side_effect=error))
+    with pytest.raises(BMRLError, match=f"needs one more package: {error}"):
+        extrapolation.check_settings(extrapolation.Settings(run_dir="runs/mine"))
 
 
 @pytest.mark.slow

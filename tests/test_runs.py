@@ -71,6 +71,16 @@ def test_a_new_folder_says_what_it_was_told_and_on_what_it_runs(tmp_path: Path) 
     assert {"python", "torchrl", "tensordict"} <= versions.keys()
 
 
+@pytest.mark.parametrize("build", ["+cpu", "+cu130", ""])
+def test_a_run_names_the_build_of_torch_that_package_metadata_may_lack(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, build: str
+) -> None:
+    monkeypatch.setattr(torch, "__version__", f"2.13.0{build}")
+    monkeypatch.setattr(runs.importlib.metadata, "version", lambda package: "2.13.0")
+    open_run(tmp_path, SETTINGS)
+    assert read_versions(tmp_path)["torch"] == f"2.13.0{build}"
+
+
 @pytest.mark.parametrize(
     "key", ["run_dir", "workers", "logger", "only", "base", "preset", "ablation"]
 )

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 from weakref import WeakSet
 
+import torch
 import yaml
 
 from torchrl_bmrl import __version__
@@ -53,7 +54,7 @@ ADOPTED: tuple[tuple[str, tuple[str, ...]], ...] = (
 )
 """What a run takes from its base: files, and the settings that decide them."""
 LOGGERS = ("csv", "wandb", "tensorboard", "none")
-PACKAGES = ("torch", "torchrl", "tensordict", "robosuite", "mujoco", "gymnasium", "numpy", "h5py")
+PACKAGES = ("torchrl", "tensordict", "robosuite", "mujoco", "gymnasium", "numpy", "h5py")
 
 
 def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
@@ -85,7 +86,8 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
     if not path.exists():
         base = Path(settings["base"]) if settings.get("base") else None
         theirs = read_settings(base) if base else {}
-        versions = {name: _version(name) for name in PACKAGES}
+        # Torch itself names its build (2.14.1+cu130); its package's metadata may not.
+        versions = {"torch": str(torch.__version__)} | {name: _version(name) for name in PACKAGES}
         versions |= {"torchrl_bmrl": __version__, "python": platform.python_version()}
         if commit := _commit():
             versions["commit"] = commit
