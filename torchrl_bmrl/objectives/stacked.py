@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import dispatch
-from tensordict.utils import Buffer
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.value import TD0Estimator
@@ -250,7 +249,8 @@ class StackedLoss(LossModule):
         if value is not None:
             self._paths[name] = name
             # Not by register_buffer, which finds the members' under this name.
-            self._buffers[name] = torch.stack([getattr(x, name) for x in self._losses])
+            own = torch.stack([getattr(x, name) for x in self._losses])
+            self._buffers[name] = own.to(getattr(template, name))
 
     def _all(self) -> list[LossModule]:
         return [self._template, *self._losses]
@@ -409,8 +409,8 @@ def _stack(values: Sequence[TensorDictBase]) -> TensorDictParams:
     for key, leaf in values[0].items(True, True):
         if leaf.requires_grad:
             stacked.set(key, nn.Parameter(stacked.get(key)))
-        elif isinstance(leaf, Buffer):
-            stacked.set(key, Buffer(stacked.get(key)))
+        elif isinstance(leaf, nn.Buffer):
+            stacked.set(key, nn.Buffer(stacked.get(key)))
     return TensorDictParams(stacked, no_convert="skip")
 
 
