@@ -242,15 +242,7 @@ def test_padding_may_lie_before_an_episode() -> None:
 # -- what it takes ---------------------------------------------------------------------------------
 
 
-def locked(data: TensorDict) -> TensorDict:
-    return data.lock_()
-
-
-def in_a_file(data: TensorDict) -> TensorDict:
-    return data.memmap_()
-
-
-@pytest.mark.parametrize("prepare", [TensorDict.copy, locked, in_a_file])
+@pytest.mark.parametrize("prepare", [TensorDict.copy, TensorDict.lock_, TensorDict.memmap_])
 def test_the_data_given_stay_as_they_are(prepare: Callable[[TensorDict], TensorDict]) -> None:
     data = prepare(with_random_ends(transitions(30), 0))
     before = data.clone()
