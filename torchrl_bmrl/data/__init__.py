@@ -1,8 +1,9 @@
-"""Demonstrations: episodes, files, checks, replay buffers."""
+"""Demonstrations: episodes, files, checks, n-step transitions, replay buffers."""
 
 from torchrl.data.datasets import register_dataset
 
 from torchrl_bmrl.data.episodes import Episode, stack_episodes
+from torchrl_bmrl.data.n_step import NStep
 from torchrl_bmrl.data.replay import (
     make_mixed_replay_buffer,
     make_multi_task_replay_buffer,
@@ -15,6 +16,7 @@ register_dataset("robomimic", "torchrl_bmrl.data.datasets:RobomimicExperienceRep
 
 __all__ = [
     "Episode",
+    "NStep",
     "make_mixed_replay_buffer",
     "make_multi_task_replay_buffer",
     "make_replay_buffer",

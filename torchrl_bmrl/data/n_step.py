@@ -1,0 +1,179 @@
+"""n-step transitions: rewards summed over n steps, everything after them from the last of these."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import LazyStackedTensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.objectives.checks import check_number, missing, next_key
+
+STEPS_KEY = "steps_to_next_obs"
+EPISODE_KEYS: tuple[NestedKey, ...] = (("collector", "traj_ids"), "episode")
+MASK_KEYS: tuple[NestedKey, ...] = (("collector", "mask"), "mask")
+
+
+class NStep(nn.Module):
+    r"""Turns transitions into n-step transitions that are right where an episode ends.
+
+    Row t gets the rewards of the k steps from t on and, under ``"next"``, what follows the last of
+    them:
+
+    .. math::
+        R_t = \sum_{i=0}^{k-1} \gamma^i r_{t+i}, \qquad
+        y_t = R_t + \gamma^k (1 - d_{t+k-1}) V(s_{t+k}), \qquad k \le n.
+
+    k is n, or fewer where less is left of the episode, of the data, or before padding. The target
+    y is the loss's: TorchRL's TD(0) estimator reads k and the flag d, ``("next", "terminated")``,
+    of step t + k - 1. It bootstraps after a truncation and where the data are cut off, with
+    :math:`\gamma^k`, and not after a termination.
+
+    An episode ends at its first ``done`` or ``terminated``, that step included. Where
+    ``("collector", "traj_ids")`` or ``episode`` is in the data, it ends before this number changes,
+    too. Without either, nothing tells that an episode was cut off without ``done`` and another one
+    follows: mark its last step as done and truncated, or its rows contain steps of the next one.
+    Rows whose ``("collector", "mask")`` or ``mask`` is ``False`` are padding and stay as they are.
+
+    The rewards of steps after the first are those of the actions in the data: the target is of the
+    policy that collected them for k - 1 steps. Nothing corrects that.
+
+    Reference: Sutton and Barto, Reinforcement Learning: An Introduction (2nd edition, 2018),
+    equation 7.1, http://incompleteideas.net/book/the-book-2nd.html
+
+    Args:
+        n_steps: n, at least 1; 1 leaves rewards and ``"next"`` as they are.
+        gamma: discount, between 0 and 1; the same as the loss's.
+        reward_key: reward under ``"next"``.
+        done_key: flag of an episode's end under ``"next"``.
+        terminated_key: flag of a termination under ``"next"``; the data may do without it.
+
+    Raises:
+        BMRLError: for invalid options.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> done = torch.tensor([[False], [False], [True], [False]])
+        >>> after = {"reward": torch.ones(4, 1), "done": done, "terminated": done}
+        >>> data = NStep(2, gamma=0.5)(TensorDict({"next": after}, [4]))
+        >>> data["next", "reward"].squeeze(-1).tolist()
+        [1.5, 1.5, 1.0, 1.0]
+        >>> data["next", "terminated"].squeeze(-1).tolist()
+        [False, True, True, False]
+        >>> data["steps_to_next_obs"].squeeze(-1).tolist()
+        [2, 2, 1, 1]
+    """
+
+    def __init__(
+        self,
+        n_steps: int,
+        gamma: float,
+        *,
+        reward_key: NestedKey = "reward",
+        done_key: NestedKey = "done",
+        terminated_key: NestedKey = "terminated",
+    ) -> None:
+        super().__init__()
+        self.n_steps = check_number("n_steps", n_steps, 1, integer=True)
+        self.gamma = float(check_number("gamma", gamma, 0.0, 1.0))
+        self.reward_key = next_key(reward_key)
+        self.done_key = next_key(done_key)
+        self.terminated_key = next_key(terminated_key)
+
+    def extra_repr(self) -> str:
+        """n and the discount, for ``repr``."""
+        return f"n_steps={self.n_steps}, gamma={self.gamma}"
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Makes n-step transitions; the data given stay as they are.
+
+        Args:
+            tensordict: transitions in order of time along the last batch dimension: ``[T]``, with
+                several episodes one after the other, or ``[*B, T]``. Transitions drawn at random
+                have no such order: apply this to whole episodes, before a replay buffer takes them,
+                or as a collector's ``postproc``. Under ``"next"`` it reads the reward
+                ``(*B, T, 1)`` and the flags ``(*B, T, 1)`` bool.
+
+        Returns:
+            a copy with all of ``"next"`` replaced and k in ``steps_to_next_obs (*B, T, 1)`` int64.
+
+        Raises:
+            BMRLError: for data without transitions, without reward or done, with an entry of
+                another shape or type, or with ``steps_to_next_obs`` already.
+        """
+        if not tensordict.batch_dims or not tensordict.batch_size.numel():
+            size = list(tensordict.batch_size)
+            raise BMRLError(f"the data have the batch size {size}; valid: [*B, T] with T >= 1")
+        if tensordict.get(STEPS_KEY, None) is not None:
+            raise BMRLError(f"the data have {STEPS_KEY!r} already; valid: transitions of one step")
+        data = tensordict.copy()
+        ends = self._ends(data)
+        # gamma ** i is a Python number: rewards keep their dtype, and float64 its precision.
+        single = self._outcome(data, self.reward_key)[..., 0]
+        reward, steps = single.clone(), torch.ones_like(ends, dtype=torch.int64)
+        alive = torch.ones_like(ends)
+        for i in range(1, self.n_steps):
+            # Row t goes on to step t + i if that is in the data and none before it is an end.
+            alive = alive[..., :-1] & ~ends[..., i - 1 : -1]
+            if not alive.any():
+                break
+            later = self.gamma**i * single[..., i:]
+            reward[..., :-i] += later.where(alive, torch.zeros_like(later))
+            steps[..., :-i] += alive
+        after = data.get("next")
+        if isinstance(after, LazyStackedTensorDict):  # along time it could not be indexed
+            after = after.contiguous()
+        data.set("next", after[_last_steps(steps)])
+        data.set(self.reward_key, reward.unsqueeze(-1))
+        return data.set(STEPS_KEY, steps.unsqueeze(-1))
+
+    def _ends(self, data: TensorDictBase) -> Tensor:
+        """Steps that no row goes beyond, ``(*B, T)``."""
+        ends = self._outcome(data, self.done_key)[..., 0].clone()
+        if data.get(self.terminated_key, None) is not None:
+            ends |= self._outcome(data, self.terminated_key)[..., 0]
+        for key in EPISODE_KEYS:
+            if (number := data.get(key, None)) is not None:
+                number = _check_tensor(key, number).reshape(*ends.shape, -1)
+                ends[..., :-1] |= (number[..., 1:, :] != number[..., :-1, :]).any(-1)
+        for key in MASK_KEYS:
+            if (mask := data.get(key, None)) is not None:
+                mask = _check_tensor(key, mask)
+                if mask.dtype != torch.bool or mask.numel() != ends.numel():
+                    raise BMRLError(
+                        f"{key!r} is {mask.dtype} {tuple(mask.shape)}; valid: torch.bool "
+                        f"{tuple(ends.shape)}, False for padding"
+                    )
+                padding = ~mask.reshape(ends.shape)
+                ends |= padding
+                ends[..., :-1] |= padding[..., 1:]
+        return ends
+
+    def _outcome(self, data: TensorDictBase, key: NestedKey) -> Tensor:
+        """The reward or a flag, ``(*B, T, 1)``."""
+        value = data.get(key, None)
+        if value is None:
+            raise missing(data, key)
+        value, shape = _check_tensor(key, value), (*data.batch_size, 1)
+        if value.shape != shape:
+            raise BMRLError(f"{key!r} has the shape {tuple(value.shape)}; valid: {shape}")
+        number = key == self.reward_key
+        if not (value.is_floating_point() if number else value.dtype == torch.bool):
+            valid = "floating-point numbers" if number else "torch.bool"
+            raise BMRLError(f"{key!r} is {value.dtype}; valid: {valid}")
+        return value
+
+
+def _last_steps(steps: Tensor) -> tuple[Tensor, ...]:
+    """Index of the last step of each row, one tensor for each batch dimension."""
+    # gather() would drop what is no tensor, such as strings.
+    rows = [torch.arange(size, device=steps.device) for size in steps.shape]
+    *batch, time = torch.meshgrid(*rows, indexing="ij")
+    return (*batch, time + steps - 1)
+
+
+def _check_tensor(key: NestedKey, value: object) -> Tensor:
+    if not isinstance(value, Tensor):
+        raise BMRLError(f"{key!r} is a {type(value).__name__}; valid: a tensor")
+    return value
