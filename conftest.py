@@ -8,8 +8,10 @@ for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 # Read by pytest-timeout where it is installed [s].
 os.environ.setdefault("PYTEST_TIMEOUT", "900")
 
+from collections.abc import Iterator  # noqa: E402
 from functools import cache  # noqa: E402
 from importlib.util import find_spec  # noqa: E402
+from typing import Any  # noqa: E402
 
 import pytest  # noqa: E402
 import torch  # noqa: E402
@@ -59,6 +61,38 @@ _NEEDS = {
 collect_ignore_glob = sorted(
     {glob for package, globs in _NEEDS.items() if find_spec(package) is None for glob in globs}
 )
+
+
+def _stored_by_the_configurations() -> dict[str, Any]:
+    """What the losses' configurations store in Hydra, which is left as it was.
+
+    With them come TorchRL's groups ``env`` and ``logger``; a recipe in the same process would take
+    its settings of these names for them.
+    """
+    if find_spec("hydra") is None:
+        return {}
+    from hydra.core.config_store import ConfigStore
+
+    repo = ConfigStore.instance().repo
+    before = set(repo)
+    import torchrl_bmrl.configs  # noqa: F401
+
+    return {group: repo.pop(group) for group in set(repo) - before}
+
+
+_STORED = _stored_by_the_configurations()
+
+
+@pytest.fixture
+def stored_configurations() -> Iterator[None]:
+    """Hydra with the losses' configurations, as after their import."""
+    from hydra.core.config_store import ConfigStore
+
+    repo = ConfigStore.instance().repo
+    repo.update(_STORED)
+    yield
+    for group in _STORED:
+        del repo[group]
 
 
 @cache

@@ -39,7 +39,10 @@ from torchrl.trainers.algorithms.configs import MLPConfig, TensorDictModuleConfi
 
 from torchrl_bmrl import configs
 
-pytestmark = pytest.mark.filterwarnings(NO_UPDATER)
+pytestmark = [
+    pytest.mark.filterwarnings(NO_UPDATER),
+    pytest.mark.usefixtures("stored_configurations"),
+]
 
 BASES = {"KeyedLoss", "OfflineLoss", "GenerativeLoss"}
 LOSSES = sorted(set(objectives.__all__) - BASES)

@@ -23,7 +23,7 @@ from helpers import (
     make_distillation_loss,
     make_generator,
     make_plas_loss,
-    undeclared,
+    undeclare,
 )
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
@@ -61,7 +61,7 @@ POLICIES: dict[str, Callable[[], Any]] = {
     "bcq": lambda: BCQPolicy.frozen(make_bcq_loss(), num_candidates=CANDIDATES),
     "live": lambda: BCQPolicy.live(make_bcq_loss(latent_clip=None), num_candidates=CANDIDATES),
     "perturbed": lambda: BCQPolicy.frozen(
-        make_bcq_loss(perturbation=True, max_perturbation=0.3, edit=undeclared),
+        make_bcq_loss(perturbation=True, max_perturbation=0.3, edit=undeclare),
         num_candidates=CANDIDATES,
     ),
     "whole generator": lambda: BCQPolicy(

@@ -14,9 +14,9 @@ from helpers import (
     NO_UPDATER,
     OBSERVATION_DIM,
     discrete_transitions,
+    guide,
     make_bcq_loss,
     make_discrete_bcq_loss,
-    make_emaq_loss,
     make_plas_loss,
     total,
     transitions,
@@ -36,7 +36,7 @@ GAMMA = 0.9
 LOSSES = {
     "bcq": (make_bcq_loss, transitions),
     "plas": (make_plas_loss, transitions),
-    "emaq": (make_emaq_loss, transitions),
+    "emaq": (guide().TestEMaQLoss.case.make, transitions),
     "discrete_bcq": (make_discrete_bcq_loss, discrete_transitions),
 }
 every_loss = pytest.mark.parametrize(("make", "draw"), LOSSES.values(), ids=LOSSES)
@@ -127,6 +127,7 @@ def test_targets_are_those_of_two_loops(make: Any, draw: Any, n: int) -> None:
 @every_loss
 def test_a_loss_trains_on_samples_of_the_data(make: Any, draw: Any) -> None:
     data = NStep(3, GAMMA)(with_random_ends(draw(30), 0))
+    torch.manual_seed(0)
     batch = make_replay_buffer(data, batch_size=16).sample()
     assert set(batch["steps_to_next_obs"].unique().tolist()) == {1, 2, 3}
     total(make(gamma=GAMMA)(batch)).backward()

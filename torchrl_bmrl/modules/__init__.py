@@ -1,5 +1,6 @@
 """Networks, the acting policy, and the task embedding."""
 
+from torchrl_bmrl.modules.following import extract_critic, extract_network
 from torchrl_bmrl.modules.generator import (
     ActionVAE,
     make_decoder,
@@ -8,13 +9,7 @@ from torchrl_bmrl.modules.generator import (
     make_qvalue_network,
 )
 from torchrl_bmrl.modules.latent_action import HeldTaskLatent, task_latent_box
-from torchrl_bmrl.modules.policy import (
-    BCQPolicy,
-    DiscreteBCQPolicy,
-    PLASPolicy,
-    extract_critic,
-    extract_network,
-)
+from torchrl_bmrl.modules.policy import BCQPolicy, DiscreteBCQPolicy, PLASPolicy
 from torchrl_bmrl.modules.task_latent import (
     DemonstrationTaskLatent,
     OnlineTaskLatent,

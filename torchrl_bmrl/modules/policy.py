@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from copy import deepcopy
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn.functional import one_hot
@@ -17,89 +15,14 @@ from torch.nn.functional import one_hot
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.functional import likely_actions, perturbed_action
 from torchrl_bmrl.generators import ActionKeys, decode_draws
+from torchrl_bmrl.modules.following import LossPolicy, as_number, dispatched, key_options, link
 from torchrl_bmrl.ownership import check_trained
 
 if TYPE_CHECKING:
     from torchrl.objectives import LossModule
 
-Self = TypeVar("Self", bound="_Policy")
 
-
-def _dispatch(forward: Callable[..., Any]) -> Callable[..., Any]:
-    """Tensordict's ``dispatch``, whose signature also says that keywords are taken.
-
-    ``torch.export`` binds a call to the signature. It takes dynamic shapes for names alone, so the
-    usual keys are among them.
-    """
-    wrapper = dispatch(forward)
-    signature = inspect.signature(wrapper)
-    named = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None)
-        for name in ("observation", "task_latent")
-    ]
-    others = inspect.Parameter("keywords", inspect.Parameter.VAR_KEYWORD)
-    wrapper.__signature__ = signature.replace(
-        parameters=[*signature.parameters.values(), *named, others]
-    )
-    return wrapper
-
-
-class _Policy(TensorDictModuleBase):
-    """What the policies share: where their networks come from, and calls with keywords."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.__dict__["_source"] = None
-
-    def _follows(self: Self, loss: Any, links: Sequence[_Link], numbers: Mapping[str, str]) -> Self:
-        """Makes the policy act with a loss's own parameters, whatever becomes of them.
-
-        Args:
-            loss: that is followed.
-            links: the policy's networks and where the loss keeps their parameters.
-            numbers: names of the policy's numbers, and of the loss's coefficients.
-        """
-        # Outside _modules: the loss's parameters are not the policy's.
-        self.__dict__["_source"] = (loss, list(links), dict(numbers))
-        self.follow()
-        return self
-
-    def follow(self) -> None:
-        """Takes over the present parameters of the loss that a live policy follows.
-
-        Every call of the policy does it; only what reads ``state_dict()`` after the loss has moved
-        to another device or type, and before the next call, must ask for it. For a frozen policy
-        nothing happens.
-        """
-        source = self.__dict__.get("_source")
-        if source is None or torch.compiler.is_compiling():
-            return
-        loss, links, numbers = source
-        for link in links:
-            for own, now in zip(link.own, link.leaves(loss), strict=True):
-                own.data = now.detach()  # the same memory, not a copy
-        for name, coefficient in numbers.items():
-            setattr(self, name, getattr(loss, coefficient))
-
-    def _states(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The data; in a keyword call's, whose batch size is a guess, features are not rows."""
-        rows = tensordict.batch_size
-        values = [tensordict.get(key, None) for key in self.in_keys]
-        if not rows or all(value is None or value.shape != rows for value in values):
-            return tensordict
-        result = TensorDict({}, rows[:-1])
-        for key, value in zip(self.in_keys, values, strict=True):
-            if value is not None:
-                result.set(key, value)
-        return result
-
-    def __getstate__(self) -> dict[str, Any]:
-        # A copy, or what a worker is sent, stands alone; its weights can be updated.
-        self.follow()
-        return self.__dict__ | {"_source": None}
-
-
-class BCQPolicy(_Policy):
+class BCQPolicy(LossPolicy):
     r"""The best of many proposed actions.
 
     .. math:: \pi(s) = a_{i^*},\quad i^* = \arg\max_i Q_1(s, a_i),\quad
@@ -217,11 +140,11 @@ class BCQPolicy(_Policy):
     @classmethod
     def _of(cls, loss: Any, num_candidates: int, *, live: bool) -> BCQPolicy:
         student = "student_" * hasattr(loss, "student_generator")
-        generator = _link(loss, f"{student}generator", live)
+        generator = link(loss, f"{student}generator", live)
         # Acting needs no encoder.
         part = getattr(generator.module, "decoder", generator.module)
-        critic = _link(loss, f"{student}qvalue_network", live, critic=0)
-        perturbation = None if student else _link(loss, "perturbation_network", live, optional=True)
+        critic = link(loss, f"{student}qvalue_network", live, critic=0)
+        perturbation = None if student else link(loss, "perturbation_network", live, optional=True)
         bounds = None if student else (loss.action_low, loss.action_high)
         latent_dim = getattr(loss if student else generator.module, "latent_dim", None)
         names = ["action", "action_latent", "state_action_value"]
@@ -231,10 +154,10 @@ class BCQPolicy(_Policy):
             None if perturbation is None else perturbation.module,
             latent_dim=latent_dim,
             num_candidates=num_candidates,
-            latent_clip=_number(loss.latent_clip),
+            latent_clip=as_number(loss.latent_clip),
             bounds=bounds,
-            max_perturbation=0.0 if student else _number(loss.max_perturbation),
-            **_keys(loss, *names, *(["perturbation"] if not student else [])),
+            max_perturbation=0.0 if student else as_number(loss.max_perturbation),
+            **key_options(loss, *names, *(["perturbation"] if not student else [])),
         )
         if not live:
             return policy
@@ -244,12 +167,12 @@ class BCQPolicy(_Policy):
             numbers |= {name: name for name in ("max_perturbation", "action_low", "action_high")}
         return policy._follows(loss, links, numbers)
 
-    @_dispatch
+    @dispatched
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action."""
         self.follow()
-        tensordict = self._states(tensordict)
+        tensordict = self.states_of(tensordict)
         proposals = self.propose(tensordict.select(*self.in_keys))
         return tensordict.set(self.keys.action, self.choose(proposals))
 
@@ -287,7 +210,7 @@ class BCQPolicy(_Policy):
         return decode_draws(self.generator, tensordict, number, self.latent_dim, keys, clip, weight)
 
 
-class PLASPolicy(_Policy):
+class PLASPolicy(LossPolicy):
     r"""The action decoded from the latent that a policy chooses.
 
     .. math:: \mu(s) = a + \phi\, h\, \xi(s, a),\quad a = G(s, \pi(s))
@@ -372,15 +295,15 @@ class PLASPolicy(_Policy):
 
     @classmethod
     def _of(cls, loss: Any, *, live: bool) -> PLASPolicy:
-        generator, actor = (_link(loss, name, live) for name in ("generator", "actor_network"))
-        perturbation = _link(loss, "perturbation_network", live, optional=True)
+        generator, actor = (link(loss, name, live) for name in ("generator", "actor_network"))
+        perturbation = link(loss, "perturbation_network", live, optional=True)
         policy = cls(
             actor.module,
             generator.module.decoder,
             None if perturbation is None else perturbation.module,
-            max_perturbation=_number(loss.max_perturbation),
+            max_perturbation=as_number(loss.max_perturbation),
             bounds=(loss.action_low, loss.action_high),
-            **_keys(loss, "action", "action_latent", "perturbation"),
+            **key_options(loss, "action", "action_latent", "perturbation"),
         )
         if not live:
             return policy
@@ -388,17 +311,17 @@ class PLASPolicy(_Policy):
         names = ("max_perturbation", "action_low", "action_high")
         return policy._follows(loss, links, {name: name for name in names})
 
-    @_dispatch
+    @dispatched
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes ``action``."""
         self.follow()
-        tensordict = self._states(tensordict)
+        tensordict = self.states_of(tensordict)
         data = _perturb(self, self.decoder(self.actor_network(tensordict.select(*self.in_keys))))
         return tensordict.set(self.keys.action, data.get(self.keys.action))
 
 
-class DiscreteBCQPolicy(_Policy):
+class DiscreteBCQPolicy(LossPolicy):
     r"""The most valuable of the actions that are likely enough.
 
     .. math:: \pi(s) = \arg\max_a \{Q_1(s, a) : G(a|s) / \max_{a'} G(a'|s) > \tau\}
@@ -484,16 +407,16 @@ class DiscreteBCQPolicy(_Policy):
 
     @classmethod
     def _of(cls, loss: Any, *, live: bool) -> DiscreteBCQPolicy:
-        links = [_link(loss, "generator", live), _link(loss, "qvalue_network", live, critic=0)]
+        links = [link(loss, "generator", live), link(loss, "qvalue_network", live, critic=0)]
         policy = cls(
             *(link.module for link in links),
-            threshold=_number(loss.threshold),
+            threshold=as_number(loss.threshold),
             action_space=loss.action_space,
-            **_keys(loss, "action", "logits", "action_value"),
+            **key_options(loss, "action", "logits", "action_value"),
         )
         return policy._follows(loss, links, {"threshold": "threshold"}) if live else policy
 
-    @_dispatch
+    @dispatched
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes ``action``.
@@ -502,7 +425,7 @@ class DiscreteBCQPolicy(_Policy):
             BMRLError: if generator and critic know different numbers of actions.
         """
         self.follow()
-        tensordict = self._states(tensordict)
+        tensordict = self.states_of(tensordict)
         data = self.qvalue_network(self.generator(tensordict.select(*self.in_keys)))
         logits, value = data.get(self.logits_key), data.get(self.action_value_key)
         if logits.shape != value.shape:
@@ -517,61 +440,7 @@ class DiscreteBCQPolicy(_Policy):
         return tensordict.set(self.out_keys[0], action)
 
 
-# -- from a loss to a policy -----------------------------------------------------------------------
-
-
-class _Link:
-    """A policy's network and where a loss keeps its parameters.
-
-    Args:
-        module: the policy's own network.
-        name: of the loss's network.
-        critic: which of the loss's critics it is.
-    """
-
-    def __init__(self, module: Any, name: str, critic: int | None) -> None:
-        self.module, self.name, self.critic = module, name, critic
-        params = TensorDict.from_module(module)
-        self.keys = list(params.keys(include_nested=True, leaves_only=True))
-        self.own = [params.get(key) for key in self.keys]
-
-    def leaves(self, loss: Any) -> list[Tensor]:
-        """The loss's parameters and buffers, in the order of the network's own."""
-        params = _held(loss, self.name, self.critic)[1]
-        return [params.get(key) for key in self.keys]
-
-
-def _held(loss: Any, name: str, critic: int | None) -> tuple[Any, TensorDictBase]:
-    """A loss's network and its parameters."""
-    if critic is not None and hasattr(loss, "critic"):
-        return loss.critic(critic)
-    params = getattr(loss, f"{name}_params")
-    return getattr(loss, name), getattr(params, "_param_td", params)
-
-
-def _link(
-    loss: Any, name: str, live: bool, *, critic: int | None = None, optional: bool = False
-) -> Any:
-    """A stand-alone network with a loss's parameters, or a copy of them."""
-    if hasattr(loss, "member"):
-        raise BMRLError(
-            f"a {type(loss).__name__} has {len(loss)} policies; valid: a policy of one member, "
-            "frozen(stack.member(index))"
-        )
-    module = getattr(loss, name, None)
-    if module is None:
-        if optional:
-            return None
-        raise BMRLError(
-            f"{type(loss).__name__} has no {name}; valid: a loss that trains one, or the policy's "
-            "own constructor"
-        )
-    module, params = _held(loss, name, critic)
-    return _Link(_instantiate(module, params, live), name, critic)
-
-
-def _number(value: Any) -> Any:
-    return None if value is None else float(value)
+# -- what the policies check -----------------------------------------------------------------------
 
 
 def _latent_dim(generator: Any, given: int | None, key: NestedKey) -> Any:
@@ -619,54 +488,3 @@ def _state_keys(networks: Iterable[TensorDictModule | None], made: Iterable[Any]
     """What networks read beside what they make for each other."""
     keys = [key for network in networks if network is not None for key in network.in_keys]
     return [key for key in dict.fromkeys(keys) if key not in set(made)]
-
-
-def _keys(loss: LossModule, *names: str) -> dict[str, NestedKey]:
-    """Arguments that carry a loss's names of keys over to its policy."""
-    return {f"{name}_key": getattr(loss.tensor_keys, name) for name in names}
-
-
-def extract_network(loss: LossModule, name: str) -> Any:
-    """A stand-alone, frozen copy of one of a loss's networks; ``None`` for one it does not have.
-
-    Args:
-        loss: such as :class:`~torchrl_bmrl.objectives.PLASLoss`.
-        name: such as ``"generator"``; for a critic see :func:`extract_critic`.
-
-    Example:
-        >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
-        >>> from torchrl_bmrl.objectives import BCQLoss
-        >>> loss = BCQLoss(ActionVAE(3, 2), make_qvalue_network(3, 2), bounds=(-1.0, 1.0))
-        >>> extract_network(loss, "generator").decoder.out_keys
-        ['action']
-    """
-    module = getattr(loss, name)
-    return None if module is None else _instantiate(module, getattr(loss, f"{name}_params"))
-
-
-def extract_critic(loss: LossModule, index: int = 0) -> TensorDictModule:
-    """A stand-alone, frozen copy of one of a loss's critics.
-
-    Args:
-        loss: such as :class:`~torchrl_bmrl.objectives.BCQLoss`.
-        index: of the critic; policies act by the first, 0.
-
-    Example:
-        >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
-        >>> from torchrl_bmrl.objectives import BCQLoss
-        >>> loss = BCQLoss(ActionVAE(3, 2), make_qvalue_network(3, 2), bounds=(-1.0, 1.0))
-        >>> extract_critic(loss, 1).out_keys
-        ['state_action_value']
-    """
-    return _instantiate(*loss.critic(index))
-
-
-def _instantiate(
-    module: TensorDictModule, params: TensorDictBase, live: bool = False
-) -> TensorDictModule:
-    """A stand-alone module with the given parameters, in their own memory if it is live."""
-    module = deepcopy(module)
-    # As parameters: plain tensors would act, but be missing from parameters() and state_dict().
-    own = TensorDictParams(params.data if live else params.data.clone())
-    own.to_module(module, preserve_module_state=False)
-    return module.requires_grad_(False)
