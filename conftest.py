@@ -19,6 +19,7 @@ torch.set_num_threads(1)
 # Modules whose import, or whose docstrings' examples, need an extra.
 _NEEDS = {
     "gymnasium": [
+        "torchrl_bmrl/data/convert.py",
         "torchrl_bmrl/data/demonstrations.py",
         "torchrl_bmrl/envs/*",
         "torchrl_bmrl/reports/films.py",
@@ -44,6 +45,7 @@ _NEEDS = {
     ],
     "hydra": ["tests/small_runs.py"],
     "matplotlib": ["tests/published_data.py", "torchrl_bmrl/reports/*"],
+    "minari": ["torchrl_bmrl/data/convert.py"],
     "mujoco": ["torchrl_bmrl/reports/films.py"],
     "robosuite": [
         "torchrl_bmrl/envs/*",
@@ -52,6 +54,7 @@ _NEEDS = {
     ],
     "safetensors": ["torchrl_bmrl/agents.py", "torchrl_bmrl/checkpoint.py"],
     "scipy": ["torchrl_bmrl/evaluation/*", "torchrl_bmrl/reports/*"],
+    "sklearn": ["torchrl_bmrl/evaluation/embedding.py", "torchrl_bmrl/reports/figures.py"],
     "tqdm": ["torchrl_bmrl/data/__main__.py", "torchrl_bmrl/parallel.py"],
     "yaml": ["torchrl_bmrl/runs.py"],
 }
