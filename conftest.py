@@ -21,6 +21,7 @@ torch.set_num_threads(1)
 # Modules whose import, or whose docstrings' examples, need an extra.
 _NEEDS = {
     "gymnasium": [
+        "torchrl_bmrl/data/convert.py",
         "torchrl_bmrl/data/demonstrations.py",
         "torchrl_bmrl/envs/*",
         "torchrl_bmrl/reports/films.py",
@@ -46,6 +47,7 @@ _NEEDS = {
     ],
     "hydra": ["tests/small_runs.py", "torchrl_bmrl/configs.py"],
     "matplotlib": ["tests/published_data.py", "torchrl_bmrl/reports/*"],
+    "minari": ["torchrl_bmrl/data/convert.py"],
     "mujoco": ["torchrl_bmrl/reports/films.py"],
     "onnxscript": ["torchrl_bmrl/export.py"],
     "robosuite": [
@@ -55,6 +57,7 @@ _NEEDS = {
     ],
     "safetensors": ["torchrl_bmrl/agents.py", "torchrl_bmrl/checkpoint.py"],
     "scipy": ["torchrl_bmrl/evaluation/*", "torchrl_bmrl/reports/*"],
+    "sklearn": ["torchrl_bmrl/evaluation/embedding.py", "torchrl_bmrl/reports/figures.py"],
     "tqdm": ["torchrl_bmrl/data/__main__.py", "torchrl_bmrl/parallel.py"],
     "yaml": ["torchrl_bmrl/runs.py"],
 }

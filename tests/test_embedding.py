@@ -220,6 +220,7 @@ def test_what_does_not_fit_is_refused_by_name() -> None:
 
 
 def test_stages_are_looked_for_in_successful_episodes_alone() -> None:
+    pytest.importorskip("matplotlib")
     from torchrl_bmrl.names import TASKS
     from torchrl_bmrl.reports import Embeddings
 

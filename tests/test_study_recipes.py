@@ -374,6 +374,7 @@ def test_one_seed_learns_the_same_twice(run: Run, finished: Path, tmp_path: Path
 
 
 def test_steps_to_half_are_those_of_the_first_evaluation_that_reaches_it(recipes: Any) -> None:
+    pytest.importorskip("matplotlib")
     import latent_sac
 
     def agent(*successes: float) -> list[dict[str, Any]]:
