@@ -290,7 +290,7 @@ def check_written(tensordict: TensorDictBase, key: NestedKey, network: TensorDic
         ...     {"observation": torch.zeros(1, 3), "action_latent": torch.zeros(1, 4)}
         ... )
         >>> check_written(decoder(data), "action", decoder).shape
-        torch.Size([2])
+        torch.Size([1, 2])
     """
     value = tensordict.get(key, None)
     if value is None or key not in network.out_keys:

@@ -258,7 +258,7 @@ def rank_correlation(
 
     Example:
         >>> print(rank_correlation([0.1, 0.2, 0.3], [10.0, 20.0, 20.0]))
-        0.8
+        0.87 [0.00, 1.00]
     """
     from scipy.stats import rankdata
 

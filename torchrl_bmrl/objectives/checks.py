@@ -220,7 +220,7 @@ def readable(value: Tensor) -> bool:
     return not (
         torch.compiler.is_compiling()
         or value.device.type != "cpu"
-        or torch._C._functorch.is_batchedtensor(value)
+        or torch.func.debug_unwrap(value).ndim > value.ndim  # under vmap a dimension is hidden
     )
 
 
