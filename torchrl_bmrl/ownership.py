@@ -13,7 +13,7 @@ _COPIED: WeakKeyDictionary[nn.Module, str] = WeakKeyDictionary()
 
 
 def note_copied(network: nn.Module, loss: str) -> None:
-    """Notes that a loss trains a copy of a network, and not the network itself.
+    """Notes that a loss trains a copy of a network, and not the network itself or its parts.
 
     Args:
         network: as the user gave it.
@@ -22,7 +22,22 @@ def note_copied(network: nn.Module, loss: str) -> None:
     Example:
         >>> note_copied(nn.Linear(1, 1), "BCQLoss")
     """
-    _COPIED[network] = loss
+    for part in network.modules():
+        if next(part.parameters(), None) is not None:  # an activation may serve other networks, too
+            _COPIED[part] = loss
+
+
+def is_copied(network: nn.Module) -> bool:
+    """Whether a loss trains a copy of a network, or a stack of losses that of a loss.
+
+    Args:
+        network: the network or loss.
+
+    Example:
+        >>> is_copied(nn.Linear(1, 1))
+        False
+    """
+    return network in _COPIED
 
 
 def check_trained(name: str, network: Any) -> None:
@@ -44,7 +59,8 @@ def check_trained(name: str, network: Any) -> None:
         ...
         torchrl_bmrl.errors.BMRLError: qvalue_network was copied into a BCQLoss, which trains ...
     """
-    loss = _COPIED.get(network)
+    parts = network.modules() if isinstance(network, nn.Module) else ()
+    loss = next((_COPIED[part] for part in parts if part in _COPIED), None)
     if loss is not None:
         raise BMRLError(
             f"{name} was copied into a {loss}, which trains the copy: this one stays untrained; "

@@ -43,6 +43,8 @@ def make_adam(params: Iterable[Tensor], lr: float) -> Adam:
         tensor(0.0010)
     """
     params = list(params)
+    if not params:
+        raise BMRLError("no parameters; valid: at least one that is trained")
     for param in params:
         if not torch.ops.aten.is_non_overlapping_and_dense(param):
             raise BMRLError(
@@ -85,7 +87,7 @@ def load_adam(optimizer: Adam, state: dict[str, Any]) -> None:
     """Takes over what ``state_dict()`` gave, onto the optimizer's own device."""
     optimizer.load_state_dict(state)
     for group in optimizer.param_groups:
-        group["lr"] = group["lr"].to(group["params"][0].device)
+        group["lr"] = torch.as_tensor(group["lr"]).to(group["params"][0].device)
         for param in group["params"]:
             held = optimizer.state[param]
             for name in ("exp_avg", "exp_avg_sq"):
@@ -143,8 +145,8 @@ def gradient_step(optimizer: Adam, loss: Tensor, max_norm: float | None = None) 
         max_norm: bound on the norm of the gradient, of each member for itself.
 
     Raises:
-        BMRLError: for an optimizer with several groups of parameters, or options that this step
-            does not take.
+        BMRLError: for an optimizer with several groups of parameters, options that this step does
+            not take, or a loss that does not depend on its parameters.
 
     Example:
         >>> weight = torch.nn.Parameter(torch.ones(1))
@@ -154,7 +156,15 @@ def gradient_step(optimizer: Adam, loss: Tensor, max_norm: float | None = None) 
     """
     group = _only_group(optimizer)
     params = group["params"]
-    grads = torch.autograd.grad(loss.sum(), params, materialize_grads=True)
+    grads = torch.autograd.grad(loss.sum(), params, allow_unused=True)
+    if all(grad is None for grad in grads):
+        raise BMRLError(
+            "the loss does not depend on the optimizer's parameters; valid: the loss's own, such "
+            "as loss.qvalue_network_params.parameters(), not those of a module that it copied"
+        )
+    # As torch's Adam: a parameter that the loss does not depend on stays, and its momentum with it.
+    params = [param for param, grad in zip(params, grads, strict=True) if grad is not None]
+    grads = [grad for grad in grads if grad is not None]
     # The fused kernel goes through memory as the parameter lies; gradients may lie otherwise.
     grads = [_laid_out_as(param, grad) for param, grad in zip(params, grads, strict=True)]
     state = [optimizer.state[param] for param in params]
@@ -221,7 +231,8 @@ def _traced_adam(
 ) -> None:
     """The fused kernel's equations; that kernel the compiler cannot join with what is around it."""
     torch._foreach_add_(steps, 1.0)
-    # Once, and as the fused kernel in float64: of 1 - 0.999 float32 has four digits.
+    # Once, since they count alike, and as the fused kernel in float64: of 1 - 0.999 float32 has
+    # four digits.
     count = steps[0].double()
     rate = lr.double() / (1.0 - beta1**count)
     root = (1.0 - beta2**count).rsqrt()

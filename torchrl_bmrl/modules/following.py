@@ -5,15 +5,18 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
+from functools import wraps
 from typing import TYPE_CHECKING, Any, TypeVar
+from weakref import WeakSet
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.ownership import is_copied
 
 if TYPE_CHECKING:
     from torchrl.objectives import LossModule
@@ -22,22 +25,38 @@ Self = TypeVar("Self", bound="LossPolicy")
 
 
 def dispatched(forward: Callable[..., Any]) -> Callable[..., Any]:
-    """Tensordict's ``dispatch``, whose signature also says that keywords are taken.
+    """A policy's ``forward`` that also takes tensors, by keyword or in the order of ``in_keys``.
 
-    ``torch.export`` binds a call to the signature. It takes dynamic shapes for names alone, so the
-    usual keys are among them.
+    It does what tensordict's ``dispatch`` does, and knows which dimensions are rows: where a
+    network says the size of an entry, all but the last one; of another, such as a picture, the
+    first.
+    The signature names the usual keys, since ``torch.export`` takes dynamic shapes for names alone.
     """
-    wrapper = dispatch(forward)
-    signature = inspect.signature(wrapper)
+
+    @wraps(forward)
+    def call(self: Any, tensordict: Any = None, *values: Tensor, **keywords: Tensor) -> Any:
+        if isinstance(tensordict, TensorDictBase):
+            return forward(self, tensordict)
+        names = {"_".join([key] if isinstance(key, str) else key): key for key in self.in_keys}
+        given = () if tensordict is None else (tensordict, *values)
+        entries = dict(zip(names, given, strict=False)) | keywords
+        if len(given) > len(names) or set(entries) != set(names):
+            raise TypeError(
+                f"{type(self).__name__} got {sorted(entries)}; valid: {sorted(names)}, each once"
+            )
+        return forward(self, self.rows_of({names[k]: x for k, x in entries.items()})).get(
+            self.out_keys[0]
+        )
+
+    own, tensordict = inspect.signature(forward).parameters.values()
     named = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None)
         for name in ("observation", "task_latent")
     ]
     others = inspect.Parameter("keywords", inspect.Parameter.VAR_KEYWORD)
-    wrapper.__signature__ = signature.replace(
-        parameters=[*signature.parameters.values(), *named, others]
-    )
-    return wrapper
+    parameters = [own, tensordict.replace(default=None), *named, others]
+    call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    return call
 
 
 class LossPolicy(TensorDictModuleBase):
@@ -57,15 +76,16 @@ class LossPolicy(TensorDictModuleBase):
         """
         # Outside _modules: the loss's parameters are not the policy's.
         self.__dict__["_source"] = (loss, list(links), dict(numbers))
+        # The loss tells when its parameters lie elsewhere: what reads them may not call the policy.
+        loss.__dict__.setdefault("_followers", WeakSet()).add(self)
         self.follow()
         return self
 
     def follow(self) -> None:
         """Takes over the present parameters of the loss that a live policy follows.
 
-        Every call of the policy does it; only what reads ``state_dict()`` after the loss has moved
-        to another device or type, and before the next call, must ask for it. For a frozen policy
-        nothing happens.
+        Every call of the policy does it, and the loss when it moves to another device or type, or
+        when parameters or coefficients are replaced. For a frozen policy nothing happens.
         """
         source = self.__dict__.get("_source")
         if source is None or torch.compiler.is_compiling():
@@ -77,16 +97,23 @@ class LossPolicy(TensorDictModuleBase):
         for name, coefficient in numbers.items():
             setattr(self, name, getattr(loss, coefficient))
 
-    def states_of(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The data; in a keyword call's, whose batch size is a guess, features are not rows."""
-        rows = tensordict.batch_size
-        values = [tensordict.get(key, None) for key in self.in_keys]
-        if not rows or all(value is None or value.shape != rows for value in values):
-            return tensordict
-        result = TensorDict({}, rows[:-1])
-        for key, value in zip(self.in_keys, values, strict=True):
-            if value is not None:
-                result.set(key, value)
+    def rows_of(self, entries: Mapping[NestedKey, Tensor]) -> TensorDict:
+        """The entries of a call with tensors, with the batch size that they have in common.
+
+        Args:
+            entries: tensors by key.
+        """
+        sized = {key for part in self.modules() for key in getattr(part, "sizes", None) or {}}
+        batch: Any = None
+        for key, value in entries.items():
+            shape = value.shape[: value.ndim > 1]
+            if key in sized:
+                shape = value.shape[:-1]
+            if batch is None or len(shape) < len(batch):
+                batch = shape
+        result = TensorDict({}, batch)
+        for key, value in entries.items():
+            result.set(key, value)
         return result
 
     def __getstate__(self) -> dict[str, Any]:
@@ -132,6 +159,11 @@ def link(
         raise BMRLError(
             f"a {type(loss).__name__} has {len(loss)} policies; valid: a policy of one member, "
             "frozen(stack.member(index))"
+        )
+    if live and is_copied(loss):
+        raise BMRLError(
+            f"this {type(loss).__name__} is a member of a stack, which trains a copy of it; valid: "
+            "frozen(stack.member(index)), made anew after training"
         )
     module = getattr(loss, name, None)
     if module is None:

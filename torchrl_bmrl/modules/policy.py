@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn.functional import one_hot
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.functional import likely_actions, perturbed_action
@@ -91,8 +92,10 @@ class BCQPolicy(LossPolicy):
         if num_candidates < 1:
             raise BMRLError(f"num_candidates is {num_candidates}; valid: at least 1")
         check_trained("qvalue_network", qvalue_network)
+        check_trained("generator", generator)
         self.generator = generator
         self.qvalue_network = qvalue_network
+        self._flat_rows = any(isinstance(x, _BatchNorm) for x in qvalue_network.modules())
         self.perturbation_network = perturbation_network
         self.keys = ActionKeys(action=action_key, action_latent=action_latent_key)
         self.latent_dim = _latent_dim(generator, latent_dim, action_latent_key)
@@ -172,7 +175,6 @@ class BCQPolicy(LossPolicy):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action."""
         self.follow()
-        tensordict = self.states_of(tensordict)
         proposals = self.propose(tensordict.select(*self.in_keys))
         return tensordict.set(self.keys.action, self.choose(proposals))
 
@@ -187,7 +189,11 @@ class BCQPolicy(LossPolicy):
             the action, ``(*B, action_dim)``.
         """
         proposals = _perturb(self, proposals)
-        value = self.qvalue_network(proposals).get(self.state_action_value_key)
+        rows = proposals
+        if self._flat_rows:  # a BatchNorm takes the second of more than two dimensions for features
+            rows = proposals.reshape(-1)
+        value = self.qvalue_network(rows).get(self.state_action_value_key)
+        value = value.reshape(*proposals.batch_size, 1)
         best = value.argmax(dim=-2, keepdim=True)
         action = proposals.get(self.keys.action)
         best = best.expand(*best.shape[:-1], action.shape[-1])
@@ -316,7 +322,6 @@ class PLASPolicy(LossPolicy):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes ``action``."""
         self.follow()
-        tensordict = self.states_of(tensordict)
         data = _perturb(self, self.decoder(self.actor_network(tensordict.select(*self.in_keys))))
         return tensordict.set(self.keys.action, data.get(self.keys.action))
 
@@ -369,7 +374,7 @@ class DiscreteBCQPolicy(LossPolicy):
     ) -> None:
         super().__init__()
         check_trained("qvalue_network", qvalue_network)
-        action_space = action_space.replace("_", "-")
+        action_space = str(action_space).replace("_", "-")
         if action_space not in ("one-hot", "categorical"):
             raise UnknownNameError("action_space", action_space, ("one-hot", "categorical"))
         self.logits_key = logits_key
@@ -425,7 +430,6 @@ class DiscreteBCQPolicy(LossPolicy):
             BMRLError: if generator and critic know different numbers of actions.
         """
         self.follow()
-        tensordict = self.states_of(tensordict)
         data = self.qvalue_network(self.generator(tensordict.select(*self.in_keys)))
         logits, value = data.get(self.logits_key), data.get(self.action_value_key)
         if logits.shape != value.shape:
@@ -464,6 +468,7 @@ def _register_bounds(policy: Any, generator: Any, perturbation: Any, given: Any)
     bounds = given if given is not None else said if said is not None else (-1.0, 1.0)
     for name, bound, own in zip(("low", "high"), bounds, said or bounds, strict=True):
         bound = torch.as_tensor(bound)
+        bound = bound if bound.is_floating_point() else bound.to(torch.get_default_dtype())
         own = torch.as_tensor(own).to(bound)
         one, other = torch.broadcast_tensors(bound, own)
         if not torch.allclose(one, other):

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from copy import deepcopy
 from dataclasses import asdict
 from math import inf
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase, unravel_key
+from tensordict import TensorDictBase, TensorDictParams, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.objectives.checks import check_number, parts_of
+from torchrl_bmrl.objectives.checks import check_number, entry, parts_of
 
 REDUCTIONS = ("mean", "sum", "none")
 
@@ -99,8 +100,13 @@ class KeyedLoss(LossModule):
 
     def __setattr__(self, name: str, value: Any) -> None:
         limits = self.__dict__.get("_coefficients", {}).get(name)
-        if limits is None or isinstance(value, Tensor):
+        # A tensor with a gradient, or of members under vmap, takes the buffer's place.
+        if limits is None or (
+            isinstance(value, Tensor) and (value.requires_grad or value.numel() != 1)
+        ):
             super().__setattr__(name, value)
+            if name.endswith("_params") and self.__dict__.get("_out_keys") is not None:
+                self._parameters_changed()
             return
         low, high, optional = limits
         value = check_number(name, value, low, high, optional=optional)
@@ -114,6 +120,46 @@ class KeyedLoss(LossModule):
             self.__dict__[name] = None
         else:
             self.register_coeff_buffer(name, value, **self._type_and_device)
+        self._parameters_changed()
+
+    # -- those who hold the parameters -----------------------------------------------------------
+
+    def _parameters_changed(self) -> None:
+        """Tells live policies that parameters lie elsewhere, or coefficients have come or gone."""
+        for policy in self.__dict__.get("_followers", ()):
+            policy.follow()
+
+    def _apply(self, *args: Any, **kwargs: Any) -> Any:
+        result = super()._apply(*args, **kwargs)
+        self._parameters_changed()
+        return result
+
+    def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
+        """Loads a state as :class:`torch.nn.Module` does; live policies follow."""
+        result = super().load_state_dict(*args, **kwargs)
+        self._parameters_changed()
+        return result
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Policies follow this loss, not its copies.
+        return {key: value for key, value in self.__dict__.items() if key != "_followers"}
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+        copy = type(self).__new__(type(self))
+        memo[id(self)] = copy
+        copy.__dict__.update(deepcopy(self.__getstate__(), memo))
+        # TensorDictParams copies its parameters on its own, and so unties what two networks share.
+        places: dict[int, list[tuple[str, NestedKey]]] = {}
+        for name, params in self.named_children():
+            if isinstance(params, TensorDictParams):
+                for key, leaf in params._param_td.items(True, True):
+                    places.setdefault(id(leaf), []).append((name, key))
+        for (first, key), *others in places.values():
+            for name, other in others:
+                held = copy._modules[name]._param_td
+                with held.unlock_():
+                    held.set(other, copy._modules[first]._param_td.get(key))
+        return copy
 
     # -- keys ------------------------------------------------------------------------------------
 
@@ -232,6 +278,8 @@ class KeyedLoss(LossModule):
         for key in self._loss_mask_keys():
             mask = tensordict.get(key, None)
             if mask is not None:
+                if mask.dtype != torch.bool:
+                    raise BMRLError(f"the mask {key!r} is {mask.dtype}; valid: torch.bool")
                 mask = self._expand_loss_mask(mask, mask.new_zeros(()).expand(batch))
                 valid = mask if valid is None else valid & mask
         return valid
@@ -248,7 +296,13 @@ class KeyedLoss(LossModule):
         """
         weights = self._maybe_get_priority_weight(tensordict)
         if weights is not None:
-            weights = unpadded(weights, self.valid_rows(tensordict, weights.shape))
+            valid = self.valid_rows(tensordict, loss.shape)
+            weights = entry(tensordict, self.tensor_keys.priority_weight, valid)
+            weights = weights.reshape(loss.shape)
+            if valid is not None and self.reduction == "mean":
+                # As TorchRL, and 0 where no row counts.
+                loss, total = unpadded(loss, valid), weights.sum()
+                return (loss * weights).sum() / torch.where(total == 0, 1.0, total)
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
 
 

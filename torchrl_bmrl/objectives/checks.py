@@ -13,6 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.data.tensor_specs import Composite
 
 from torchrl_bmrl.errors import BMRLError
 
@@ -212,6 +213,62 @@ def check_within(
             f"{key!r} holds {int(outside.sum())} numbers outside the bounds, the first, "
             f"{action[first].item():g}, at {first}; valid: {low.tolist()} to {high.tolist()}, or "
             "bounds of the loss and of the generator that are those of the data"
+        )
+
+
+def leaf_of(spec: Any, key: NestedKey) -> Any:
+    """The spec of one entry: itself, or that entry or the only one of a composite spec.
+
+    Args:
+        spec: of the action.
+        key: where it lies in a composite spec.
+
+    Raises:
+        BMRLError: for a composite spec with several entries, none of them under the key.
+
+    Example:
+        >>> from torchrl.data import Composite, OneHot
+        >>> leaf_of(Composite(agent=Composite(move=OneHot(4))), "action").space.n
+        4
+    """
+    if not isinstance(spec, Composite):
+        return spec
+    keys = list(spec.keys(include_nested=True, leaves_only=True))
+    if key in keys:
+        return spec[key]
+    if len(keys) != 1:
+        raise BMRLError(f"the spec has {keys}, not {key!r}; valid: the spec of the action alone")
+    return spec[keys[0]]
+
+
+def check_rows_of_tasks(key: NestedKey, task: Tensor, valid: Tensor | None) -> None:
+    """Refuses rows that hold another task than their number; on CPU and not compiled.
+
+    Args:
+        key: of the task.
+        task: class index, ``(num_tasks, B)``.
+        valid: which rows count, ``(num_tasks, B)``; ``None`` if all do.
+
+    Raises:
+        BMRLError: naming the first row that holds another task.
+
+    Example:
+        >>> check_rows_of_tasks("task", torch.tensor([[0, 0], [1, 1]]), None)
+        >>> check_rows_of_tasks("task", torch.tensor([[0, 1], [0, 1]]), None)
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.BMRLError: 'task' holds 1 in row 0; valid: 0 there, since row i of ...
+    """
+    if not readable(task):
+        return
+    wrong = task != torch.arange(len(task), device=task.device).unsqueeze(-1)
+    if valid is not None:
+        wrong &= valid
+    if wrong.any():
+        row, column = wrong.nonzero()[0].tolist()
+        raise BMRLError(
+            f"{key!r} holds {int(task[row, column])} in row {row}; valid: {row} there, since row i "
+            "of the data is the i-th teacher's task"
         )
 
 

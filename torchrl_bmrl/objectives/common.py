@@ -179,10 +179,10 @@ class OfflineLoss(KeyedLoss):
         owners = [id(p) for critic in critics for p in critic.parameters()]
         known = {id(p) for p in self.parameters()}
         # Stacking makes new parameters and keeps one structure, so critics that differ, share
-        # parameters with each other or another network, or have no shapes yet, stay apart; of a
-        # list of one, TorchRL would make no parameters at all.
-        lazy = any(map(is_lazy, critics))
-        alike = not lazy and len({kind(critic) for critic in critics}) == 1
+        # parameters with each other, another network or within themselves, or have no shapes yet,
+        # stay apart; of a list of one, TorchRL would make no parameters at all.
+        apart = any(map(is_lazy, critics)) or any(map(_has_tied_parameters, critics))
+        alike = not apart and len({kind(critic) for critic in critics}) == 1
         self._stacked = (
             alike
             and len(critics) > 1
@@ -207,6 +207,14 @@ class OfflineLoss(KeyedLoss):
         """Ends a subclass's ``__init__``: the value estimator, and who shares parameters."""
         self.make_value_estimator(self.default_value_estimator)
         self.keep_keys()
+        self._find_shared()
+
+    def _parameters_changed(self) -> None:
+        super()._parameters_changed()
+        self._find_shared()
+
+    def _find_shared(self) -> None:
+        """Notes which parameters the networks share with the generator."""
         generator = self._modules.get("generator_params")
         own = set() if generator is None else {id(p) for p in generator.parameters()}
         self._shared_with_generator = {
@@ -411,6 +419,10 @@ class OfflineLoss(KeyedLoss):
     @property
     def gamma(self) -> float:
         """Discount of the value estimator; an assignment changes the estimator's."""
+        held = getattr(self._value_estimator, "gamma", None)
+        # The estimator's is of its own type, in which 0.99 is another number.
+        if held is not None and held.item() != torch.tensor(self._gamma, dtype=held.dtype).item():
+            self._gamma = held.item()
         return self._gamma
 
     @gamma.setter
@@ -439,6 +451,7 @@ class OfflineLoss(KeyedLoss):
             self._forward_value_estimator_keys()
             self._gamma = float(getattr(self.value_estimator, "gamma", self._gamma))
             return self
+        gamma = self.gamma
         estimator = dispatch_value_estimator(
             self,
             value_type,
@@ -449,7 +462,7 @@ class OfflineLoss(KeyedLoss):
         )
         # TorchRL keeps hyper-parameters in float32; 0.99 is another number there.
         estimator.to(**self._type_and_device)
-        exact = default_value_kwargs(self.value_type) | {"gamma": self._gamma} | hyperparams
+        exact = default_value_kwargs(self.value_type) | {"gamma": gamma} | hyperparams
         self._gamma = check_number("gamma", exact["gamma"], 0, 1)
         for name, value in exact.items():
             if name in dict(estimator.named_buffers()):
@@ -483,7 +496,10 @@ class OfflineLoss(KeyedLoss):
             if valid is not None:
                 if key == next_key(keys.done):
                     # A return must not go on from the last row that counts into the padding.
-                    goes_on = torch.cat([valid[..., 1:], valid[..., -1:]], -1)
+                    time = _time_dimension(tensordict, valid.ndim)
+                    ahead = valid.narrow(time, 1, valid.shape[time] - 1)
+                    last = valid.narrow(time, valid.shape[time] - 1, 1)
+                    goes_on = torch.cat([ahead, last], time)
                     value = value | ~(valid & goes_on).unsqueeze(-1)
                 data.set(key, value)
         return self.value_estimator.value_estimate(data).squeeze(-1).detach()
@@ -567,6 +583,12 @@ class OfflineLoss(KeyedLoss):
         return result
 
 
+def _time_dimension(tensordict: TensorDictBase, ndim: int) -> int:
+    """Where the estimators take time to be: the dimension of that name, or the last one."""
+    names = tensordict.names if tensordict.ndim == ndim else []
+    return names.index("time") if "time" in names else ndim - 1
+
+
 class _Ensemble(TensorDictModuleBase):
     """Critics that are run one after the other, their outputs stacked in front."""
 
@@ -580,11 +602,21 @@ class _Ensemble(TensorDictModuleBase):
         return torch.stack([critic(tensordict.copy()) for critic in self.critics])
 
 
+def _has_tied_parameters(module: nn.Module) -> bool:
+    """Whether two places of a network hold one parameter."""
+    names = list(module.named_parameters(remove_duplicate=False))
+    return len(names) > len(list(module.parameters()))
+
+
 def _renewed(module: TensorDictModule, shared: Sequence[nn.Parameter]) -> TensorDictModule:
     """A copy with an initialisation of its own, but for what it shares with another network."""
     copy = deepcopy(module, {id(parameter): parameter for parameter in shared})
     for name, part in copy.named_modules():
-        own = [p for p in part.parameters(recurse=False) if not any(p is other for other in shared)]
+        own = [
+            p
+            for p in part.parameters(recurse=False)
+            if p.requires_grad and not any(p is other for other in shared)
+        ]
         if own and not hasattr(part, "reset_parameters"):
             raise BMRLError(
                 f"the critic's part {name!r}, a {type(part).__name__}, has no reset_parameters() "

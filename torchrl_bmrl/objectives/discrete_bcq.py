@@ -9,7 +9,7 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data.tensor_specs import Categorical, Composite, OneHot, TensorSpec
+from torchrl.data.tensor_specs import Categorical, OneHot, TensorSpec
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.functional import likely_actions
@@ -20,6 +20,7 @@ from torchrl_bmrl.objectives.checks import (
     check_one_hot,
     check_same_shape,
     entry,
+    leaf_of,
     missing,
     next_key,
     output,
@@ -343,11 +344,11 @@ def action_space_of(
         >>> action_space_of("one_hot", "action"), action_space_of(OneHot(4), "action")
         (('one-hot', None), ('one-hot', 4))
     """
-    if isinstance(action_space, Composite):
-        action_space = action_space[action_key]
-    if isinstance(action_space, OneHot):
+    action_space = leaf_of(action_space, action_key)
+    # Their own classes alone: those of several actions at once derive from them.
+    if type(action_space) is OneHot:
         return "one-hot", action_space.space.n
-    if isinstance(action_space, Categorical):
+    if type(action_space) is Categorical:
         return "categorical", action_space.space.n
     name = action_space.replace("_", "-") if isinstance(action_space, str) else action_space
     if name not in ACTION_SPACES:

@@ -28,6 +28,7 @@ from torchrl_bmrl.objectives.checks import (
     check_index,
     check_network,
     check_number,
+    check_rows_of_tasks,
     check_same_shape,
     entry,
     is_lazy,
@@ -38,6 +39,7 @@ from torchrl_bmrl.objectives.checks import (
 )
 from torchrl_bmrl.objectives.ensemble import FrozenEnsemble
 from torchrl_bmrl.objectives.swap import holding
+from torchrl_bmrl.ownership import check_trained
 
 CONTEXTS = ("current", "previous", "random", "set")
 ENCODER_TERMS = ("classification", "generator", "direction", "qvalue", "metric")
@@ -271,6 +273,8 @@ class MetaDistillationLoss(KeyedLoss):
         teachers += [("a teacher's critic", x) for x in teacher_qvalue_networks]
         for name, module in [*students.items(), *teachers]:
             check_network(name, module)
+        for name, module in teachers:
+            check_trained(name, module)
         sizes = agreed_sizes([*students.items(), *teachers])
         said = sizes.setdefault(self.tensor_keys.action_latent, latent_dim)
         if said != latent_dim:
@@ -555,6 +559,7 @@ class MetaDistillationLoss(KeyedLoss):
                 f"{tuple(tensordict.batch_size)}"
             )
         check_index(self.tensor_keys.task, task, self.num_tasks)
+        check_rows_of_tasks(self.tensor_keys.task, task, valid)
         m = self.embed(tensordict)
         reaching = {term: m if term in self.encoder_terms else m.detach() for term in ENCODER_TERMS}
         logits = self.classify(reaching["classification"])
@@ -612,7 +617,8 @@ def _check_equal_bounds(networks: Sequence[tuple[str, Any]]) -> None:
     for name, bounds in said[1:]:
         first, other = said[0]
         for one, two in zip(other, bounds, strict=True):
-            if not torch.equal(*torch.broadcast_tensors(one.double(), two.double())):
+            pair = torch.broadcast_tensors(one.double(), two.double())
+            if not torch.allclose(pair[0], pair[1]):
                 raise BMRLError(
                     f"the actions of {name} end at {two.tolist()}, those of {first} at "
                     f"{one.tolist()}; valid: equal bounds"

@@ -72,7 +72,26 @@ def kind(module: nn.Module) -> str:
     """What tells modules apart beside their parameters: shapes, structure and plain attributes."""
     shapes = [tuple(value.shape) for value in module.state_dict().values()]
     attributes = [
-        {name: value for name, value in vars(part).items() if not name.startswith("_")}
+        {name: _whole(value) for name, value in vars(part).items() if _tells(name, value)}
         for part in module.modules()
     ]
     return f"{module} {shapes} {attributes}"
+
+
+_COMMON = frozenset(vars(TensorDictModule(nn.Identity(), in_keys=["x"], out_keys=["y"]))) - {
+    "training",
+    "in_keys",
+    "out_keys",
+}
+"""Attributes that every module has, or a TensorDictModule; they hold no choice of a user's."""
+
+
+def _tells(name: str, value: Any) -> bool:
+    """Whether an attribute is a choice of a user's; of private ones only plain values are."""
+    plain = isinstance(value, (int, float, str, torch.Tensor, type(None)))
+    return name not in _COMMON and (plain or not name.startswith("_"))
+
+
+def _whole(value: Any) -> Any:
+    """A tensor with all of its numbers, which its text abbreviates."""
+    return value.tolist() if isinstance(value, torch.Tensor) else value

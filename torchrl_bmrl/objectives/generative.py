@@ -12,7 +12,7 @@ from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data.tensor_specs import Bounded, Composite, TensorSpec
+from torchrl.data.tensor_specs import Bounded, TensorSpec
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.functional import perturbed_action
@@ -22,6 +22,7 @@ from torchrl_bmrl.objectives.checks import (
     check_network,
     check_same_shape,
     check_within,
+    leaf_of,
     next_key,
     output,
     unfit,
@@ -154,8 +155,13 @@ class GenerativeLoss(OfflineLoss):
                 )
             if other is None:
                 continue
-            other = torch.as_tensor(other).to(bound)
-            one, two = torch.broadcast_tensors(bound, other)
+            other = torch.as_tensor(other)
+            if other.ndim and bound.ndim and len(other) != len(bound):
+                raise BMRLError(
+                    f"the {name} bound of the action has {len(bound)} numbers, and the generator's "
+                    f"{len(other)}; valid: as many"
+                )
+            one, two = torch.broadcast_tensors(bound.double(), other.double().to(bound.device))
             if not torch.allclose(one, two):
                 raise BMRLError(
                     f"the {name} bound of the action is {bound.tolist()}, and the generator's "
@@ -347,15 +353,14 @@ def action_bounds(
             "give either action_spec or bounds; got " + ("neither" if bounds is None else "both")
         )
     if bounds is None:
-        if isinstance(action_spec, Composite):
-            action_spec = action_spec[action_key]
+        action_spec = leaf_of(action_spec, action_key)
         if not isinstance(action_spec, Bounded):
             raise BMRLError(f"action_spec is a {type(action_spec).__name__}; valid: Bounded")
         bounds = (action_spec.space.low, action_spec.space.high)
     # Numbers in float64: in a float64 loss 0.4 must not become 0.4 in float32.
     low, high = (
         bound
-        if isinstance(bound, Tensor)
+        if isinstance(bound, Tensor) and bound.is_floating_point()
         else torch.as_tensor(
             list(bound) if isinstance(bound, Sequence) else bound, dtype=torch.float64
         )
@@ -365,6 +370,11 @@ def action_bounds(
         raise BMRLError(
             f"the bounds of the action have the shapes {tuple(low.shape)} and {tuple(high.shape)}; "
             "valid: () or (action_dim,), so of several environments the spec of one"
+        )
+    if not (low.isfinite().all() and high.isfinite().all()):
+        raise BMRLError(
+            f"the bounds of the action are {low.tolist()} and {high.tolist()}; valid: finite "
+            "numbers, such as the smallest and largest action of the data"
         )
     if not (low <= high).all():
         raise BMRLError(f"the lower bound {low} of the action is above the upper bound {high}")

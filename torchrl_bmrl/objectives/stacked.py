@@ -18,6 +18,7 @@ from torchrl.objectives.value import TD0Estimator
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.objectives.checks import entry, is_lazy
 from torchrl_bmrl.objectives.ensemble import kind
+from torchrl_bmrl.ownership import note_copied
 
 Self = TypeVar("Self", bound="StackedLoss")
 
@@ -88,6 +89,9 @@ class StackedLoss(LossModule):
         self.deactivate_vmap = deactivate_vmap
         # Outside _modules: their own parameters are no state of the stack.
         self.__dict__["_losses"] = losses
+        for loss in losses:
+            for network in (loss, *(x for x in vars(loss).values() if isinstance(x, nn.Module))):
+                note_copied(network, type(self).__name__)
         template = deepcopy(losses[0])
         own = [_state(loss) for loss in losses]
         self._paths: dict[str, str] = {}
@@ -156,12 +160,15 @@ class StackedLoss(LossModule):
         """
         for loss in self._all():
             loss.make_value_estimator(value_type, **hyperparams)
-        # What the members had of their own is replaced by one for all.
+        self._drop_estimators()
+        return self
+
+    def _drop_estimators(self) -> None:
+        """Forgets what the members' estimators had of their own: they are alike now."""
         for name, path in list(self._paths.items()):
             if path.startswith("_value_estimator."):
                 del self._paths[name]
                 delattr(self, name)
-        return self
 
     @property
     def value_estimator(self) -> Any:
@@ -235,12 +242,19 @@ class StackedLoss(LossModule):
 
     def __setattr__(self, name: str, value: Any) -> None:
         template = self.__dict__.get("_template")
-        if template is None or name not in getattr(template, "_coefficients", ()):
+        if template is None or not _passed_on(template, name) or name in vars(self):
             super().__setattr__(name, value)
+            return
+        if name not in getattr(template, "_coefficients", ()):  # an option, such as reduction
+            for loss in self._all():
+                setattr(loss, name, value)
+            self._drop_estimators()
             return
         each = [value] * len(self)
         if isinstance(value, Tensor) and value.ndim == 1:
             each = value.tolist()
+            if len(each) != len(self):
+                raise BMRLError(f"{name} has {len(each)} numbers; valid: {len(self)}, or one")
         for loss, own in zip(self._all(), [each[0], *each], strict=True):
             setattr(loss, name, own)
         # A coefficient that was None had no buffer, and one that is None has none.
@@ -280,6 +294,8 @@ class StackedLoss(LossModule):
             the loss itself; later updates of the stack do not reach it until it is asked for again.
         """
         loss = self._losses[index]
+        reference = next(self.parameters())
+        loss.to(dtype=reference.dtype, device=reference.device)
         own = _state(loss)
         with torch.no_grad():
             for name, path in self._paths.items():
@@ -370,11 +386,10 @@ class StackedLoss(LossModule):
 
 
 def _passed_on(template: LossModule, name: str) -> bool:
-    """Whether a stack has what its members have under a name: coefficients and networks."""
-    coefficients = getattr(template, "_coefficients", ())
-    return (
-        name == "gamma" or name in coefficients or isinstance(vars(template).get(name), nn.Module)
-    )
+    """Whether a stack has what its members have: coefficients, options and networks."""
+    if name == "gamma" or name in getattr(template, "_coefficients", ()):
+        return hasattr(template, name)
+    return name in vars(template) and not name.startswith("_") and name != "training"
 
 
 def _state(loss: LossModule) -> dict[str, Any]:
