@@ -156,9 +156,10 @@ class KeyedLoss(LossModule):
                     places.setdefault(id(leaf), []).append((name, key))
         for (first, key), *others in places.values():
             for name, other in others:
-                held = copy._modules[name]._param_td
-                with held.unlock_():
-                    held.set(other, copy._modules[first]._param_td.get(key))
+                held = copy._modules[name]
+                with held._param_td.unlock_():
+                    held._param_td.set(other, copy._modules[first]._param_td.get(key))
+                held._reset_params()
         return copy
 
     # -- keys ------------------------------------------------------------------------------------
