@@ -218,4 +218,10 @@ def test_losses_without_the_policy_are_refused_by_name() -> None:
             make(stack)
     with pytest.raises(BMRLError, match="BCQLoss has no actor_network; valid"):
         PLASPolicy.live(make_bcq_loss())
+    with pytest.raises(BMRLError, match=r"PLASLoss acts by its actor_network.*valid: PLASPolicy"):
+        BCQPolicy.live(make_plas_loss())
+    loss = make_plas_loss()
+    loss.actor_network.out_keys = ["action"]
+    with pytest.raises(BMRLError, match=r"writes \['action'\]; valid: 'action_latent'"):
+        PLASPolicy.frozen(loss)
     assert act(BCQPolicy.frozen(stack.member(1))).shape == (64, 2)

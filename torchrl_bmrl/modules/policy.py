@@ -142,6 +142,12 @@ class BCQPolicy(LossPolicy):
 
     @classmethod
     def _of(cls, loss: Any, num_candidates: int, *, live: bool) -> BCQPolicy:
+        if hasattr(loss, "actor_network"):
+            raise BMRLError(
+                f"{type(loss).__name__} acts by its actor_network, not by the best of many "
+                "proposals; valid: PLASPolicy for a PLASLoss, loss.get_stateful_net("
+                "'actor_network') or extract_network(loss, 'actor_network') for another"
+            )
         student = "student_" * hasattr(loss, "student_generator")
         generator = link(loss, f"{student}generator", live)
         # Acting needs no encoder.
@@ -302,6 +308,11 @@ class PLASPolicy(LossPolicy):
     @classmethod
     def _of(cls, loss: Any, *, live: bool) -> PLASPolicy:
         generator, actor = (link(loss, name, live) for name in ("generator", "actor_network"))
+        if loss.tensor_keys.action_latent not in actor.module.out_keys:
+            raise BMRLError(
+                f"the actor_network of {type(loss).__name__} writes {actor.module.out_keys}; "
+                f"valid: {loss.tensor_keys.action_latent!r}, a latent, as of a PLASLoss"
+            )
         perturbation = link(loss, "perturbation_network", live, optional=True)
         policy = cls(
             actor.module,

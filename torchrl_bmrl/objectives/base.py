@@ -276,7 +276,10 @@ class KeyedLoss(LossModule):
             boolean, ``(*B,)``.
         """
         valid = None
+        present = tensordict.keys()
         for key in self._loss_mask_keys():
+            if (key if isinstance(key, str) else key[0]) not in present:
+                continue  # a nested look-up costs more
             mask = tensordict.get(key, None)
             if mask is not None:
                 if mask.dtype != torch.bool:

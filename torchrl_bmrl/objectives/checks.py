@@ -199,7 +199,7 @@ def check_within(
             f"{key!r} has the shape {tuple(action.shape)} and the bounds {tuple(low.shape)}; "
             "valid: a bound for each dimension"
         )
-    if not (readable(action) and readable(low)):
+    if not readable(action):
         return
     if torch.maximum(low - action, action - high).amax().item() <= 0:
         return

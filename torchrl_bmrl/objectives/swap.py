@@ -59,7 +59,15 @@ def leaves(params: TensorDictBase, module: nn.Module) -> list[Tensor]:
     """
     # TensorDictParams wraps each of its own methods; what it holds does not.
     params = getattr(params, "_param_td", params)
-    return [_at(params, path) for path in _paths(module)]
+    found = []
+    for path in _paths(module):
+        value: Any = params
+        for part in path:
+            # Where a plain TensorDict keeps it, which get() takes long for.
+            held = getattr(value, "_tensordict", None)
+            value = value.get(part) if held is None else held[part]
+        found.append(value)
+    return found
 
 
 def without_gradient(params: TensorDictBase, keys: Sequence[NestedKey]) -> TensorDictBase:
@@ -71,15 +79,6 @@ def without_gradient(params: TensorDictBase, keys: Sequence[NestedKey]) -> Tenso
 def _fill(slots: Sequence[tuple[dict[str, Tensor], str]], values: Sequence[Tensor]) -> None:
     for (owner, name), value in zip(slots, values, strict=True):
         owner[name] = value
-
-
-def _at(params: TensorDictBase, path: tuple[str, ...]) -> Tensor:
-    """The entry at a path; read where a plain TensorDict keeps it, which ``get`` takes long for."""
-    value: Any = params
-    for part in path:
-        held = getattr(value, "_tensordict", None)
-        value = value.get(part) if held is None else held[part]
-    return value
 
 
 def _paths(module: nn.Module) -> list[tuple[str, ...]]:
