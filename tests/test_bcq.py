@@ -300,7 +300,7 @@ def test_critics_of_other_structure_keep_it() -> None:
 @pytest.mark.parametrize(
     ("bounds", "message"),
     [
-        ((float("nan"), 1.0), "above the upper bound"),
+        ((float("nan"), 1.0), "bounds of the action are nan and 1.0; valid: finite numbers"),
         ((torch.zeros(4, 2), torch.ones(4, 2)), r"shapes \(4, 2\) and \(4, 2\); valid"),
     ],
 )

@@ -274,6 +274,9 @@ class KeyedLoss(LossModule):
 
         Returns:
             boolean, ``(*B,)``.
+
+        Raises:
+            BMRLError: for a mask of another type.
         """
         valid = None
         present = tensordict.keys()
