@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import shutil
 import signal
 import tempfile
@@ -122,6 +123,10 @@ def cluster() -> Iterator[str]:
     """Address of a Ray cluster of two nodes with one core each, which started elsewhere."""
     utils = pytest.importorskip("ray.cluster_utils")
     folder = tempfile.mkdtemp(prefix="ray-", dir="/tmp")  # sockets' paths must be short
+    # Ray notes a cluster's address in its usual folder, which is not there before its first use.
+    Path(importlib.import_module("ray._private.utils").get_ray_address_file(None)).parent.mkdir(
+        parents=True, exist_ok=True
+    )
     options = {"num_cpus": 1, "include_dashboard": False, "temp_dir": folder}
     for left in reversed(range(3)):  # Ray gives a node 30 s to start, whatever else runs
         nodes = utils.Cluster()
