@@ -25,6 +25,23 @@ RESERVED = frozenset(
 
 
 @dataclass(frozen=True, kw_only=True)
+class LeftOut:
+    """What a file has of an episode, and the episode that was read from it has not.
+
+    Attributes:
+        steps: at its end.
+        reward: their sum of rewards.
+        success: whether the only successful steps are among them.
+        arrays: names of what is not read, such as groups of another tool.
+    """
+
+    steps: int = 0
+    reward: float = 0.0
+    success: bool = False
+    arrays: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
 class Episode:
     """One episode of T steps; row t of every array belongs to step t.
 
@@ -39,6 +56,7 @@ class Episode:
         extras: further arrays of T rows, such as ``successes`` (bool), ``phases`` and ``states``
             (the simulator's, before each action).
         attributes: numbers, strings and lists of strings, such as ``seed`` and ``model_file``.
+        left_out: what the file that it was read from has beyond that.
 
     Example:
         >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.zeros(5)
@@ -56,9 +74,18 @@ class Episode:
     terminated: np.ndarray
     extras: Mapping[str, np.ndarray] = field(default_factory=dict)
     attributes: Mapping[str, Any] = field(default_factory=dict)
+    left_out: LeftOut = LeftOut()
 
     def __len__(self) -> int:
         return len(self.actions)
+
+    @property
+    def succeeded(self) -> bool | None:
+        """Whether the task was solved at some step; ``None`` if that is not known."""
+        if "successes" in self.extras:
+            return bool(np.any(self.extras["successes"]))
+        success = self.attributes.get("success")
+        return bool(success) if isinstance(success, bool | int) else None
 
 
 class LazyEpisodes(Mapping[str, Episode]):

@@ -1,0 +1,104 @@
+"""How a file of demonstrations is read: one set of options for loading, checking and converting."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from torchrl_bmrl.errors import ConfigError
+
+LastStep = Literal["drop", "truncate", "terminate"]
+Reward = Literal["success", "last"]
+Bounds = tuple[float | Sequence[float], float | Sequence[float]]
+"""Lowest and highest action: a number each, or one for each dimension."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadOptions:
+    """What a reader does where a file leaves something open.
+
+    Attributes:
+        split: name of a mask, such as ``"train"``; ``None`` for all episodes.
+        observation_keys: parts of the observation to read; ``None`` for all.
+        dones_terminate: whether ``dones`` at an episode's last step is a termination, in files
+            without ``terminated``. By default it is not: the simulators that these files come from
+            do not terminate, and the value after a horizon is not 0.
+        last_step: what becomes of an episode's last step where no observation after it was
+            recorded. ``"drop"`` leaves it out, its reward and success with it. ``"truncate"`` and
+            ``"terminate"`` keep it and let its own observation stand for the next one;
+            after ``"truncate"`` the value is bootstrapped from there, after ``"terminate"`` none
+            follows. ``None``: as ``"drop"``, but a data set that loses all of its reward, or all of
+            its successes, is refused. A step that terminates is kept in any case.
+        reward: where rewards come from, if not from the file. ``"success"``: 1 at each step that
+            ``successes`` marks or, in files that have only an attribute ``success``, at the last
+            step of each successful episode, and else 0. ``"last"``: 1 at every episode's last step.
+        successful: leaves out the episodes that did not succeed.
+        bounds: of floating-point actions, where they are not those that the file states or, if it
+            states none, [-1, 1]. ``"data"``: each dimension's smallest and largest.
+
+    Raises:
+        ConfigError: for invalid values.
+
+    Example:
+        >>> ReadOptions(last_step="keep")
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.ConfigError: last_step is 'keep'; valid: drop, truncate, terminate, None
+    """
+
+    split: str | None = None
+    observation_keys: Iterable[str] | None = None
+    dones_terminate: bool = False
+    last_step: LastStep | None = None
+    reward: Reward | None = None
+    successful: bool = False
+    bounds: Bounds | Literal["data"] | None = None
+
+    def __post_init__(self) -> None:
+        keys = self.observation_keys
+        if not isinstance(self.split, str | None):
+            raise ConfigError(f"split is {self.split!r}; valid: the name of a mask, or None")
+        if isinstance(keys, str) or not isinstance(keys, Iterable | None):
+            raise ConfigError(f"observation_keys is {keys!r}; valid: a list of names")
+        if keys is not None:
+            # In their order, each once.
+            object.__setattr__(self, "observation_keys", tuple(dict.fromkeys(keys)))
+        for name in ("dones_terminate", "successful"):
+            if not isinstance(getattr(self, name), bool):
+                raise ConfigError(f"{name} is {getattr(self, name)!r}; valid: True, False")
+        for name, kind in (("last_step", LastStep), ("reward", Reward)):
+            value, valid = getattr(self, name), get_args(kind)
+            if value is not None and value not in valid:
+                raise ConfigError(f"{name} is {value!r}; valid: {', '.join(valid)}, None")
+        if self.bounds is not None and self.bounds != "data":
+            object.__setattr__(self, "bounds", check_bounds(self.bounds))
+
+
+def check_bounds(bounds: Bounds, name: str = "bounds") -> Bounds:
+    """Lowest and highest action as floats, or tuples of floats.
+
+    Raises:
+        ConfigError: for anything else, and for a lowest that is not below the highest.
+
+    Example:
+        >>> check_bounds(([0, -1], 2))
+        ((0.0, -1.0), 2.0)
+    """
+    try:
+        low, high = (np.asarray(bound, dtype=float) for bound in bounds)
+        ordered = bool(np.all(low < high)) and max(low.ndim, high.ndim) < 2
+    except (TypeError, ValueError):
+        ordered = False
+    if not ordered or not (np.isfinite(low).all() and np.isfinite(high).all()):
+        raise ConfigError(
+            f"{name} is {bounds!r}; valid: two finite numbers, the lower first, or a list of one "
+            "for each dimension in place of either"
+        )
+    return _plain(low), _plain(high)
+
+
+def _plain(bound: np.ndarray) -> float | tuple[float, ...]:
+    return tuple(bound.tolist()) if bound.ndim else float(bound)

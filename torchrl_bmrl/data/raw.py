@@ -1,0 +1,138 @@
+"""Episodes as files have them, and what the options make of what they lack."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_bmrl.data.episodes import Episode, LeftOut
+from torchrl_bmrl.data.options import ReadOptions
+from torchrl_bmrl.errors import DataError
+
+
+@dataclass(frozen=True, kw_only=True)
+class RawEpisode:
+    """One episode of T steps as a file has it; what the file lacks is ``None``.
+
+    Attributes:
+        observations: named parts before each action ``(T, ...)`` or, with the one after the last,
+            ``(T + 1, ...)``; all of one length.
+        next_observations: the same parts after each action, ``(T, ...)``.
+        actions: ``(T, action_dim)``.
+        rewards: ``(T,)``.
+        terminated: ``(T,)`` bool; where no value follows.
+        dones: ``(T,)`` bool; where an episode ends, whatever the reason.
+        success: whether the episode succeeded, as its attribute says.
+        extras: further arrays of T rows, such as ``successes``.
+        attributes: numbers, strings and lists of strings.
+        left_alone: names of what is there and not read.
+    """
+
+    observations: Mapping[str, np.ndarray]
+    actions: np.ndarray
+    next_observations: Mapping[str, np.ndarray] | None = None
+    rewards: np.ndarray | None = None
+    terminated: np.ndarray | None = None
+    dones: np.ndarray | None = None
+    success: bool | None = None
+    extras: Mapping[str, np.ndarray] = field(default_factory=dict)
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    left_alone: tuple[str, ...] = ()
+
+    @property
+    def succeeded(self) -> bool | None:
+        """Whether the task was solved at some step; ``None`` where the file does not say."""
+        successes = self.extras.get("successes")
+        return self.success if successes is None else bool(np.any(successes))
+
+
+def complete(path: str | Path, name: str, raw: RawEpisode, options: ReadOptions) -> Episode:
+    """An episode of a file, with what it lacks as the options say.
+
+    Args:
+        path: file, for messages.
+        name: of the episode, for messages.
+        raw: of arrays that agree in their lengths.
+        options: see :class:`ReadOptions`.
+
+    Returns:
+        the episode; its ``left_out`` says what of the file it does not hold.
+
+    Raises:
+        DataError: naming file and key, for rewards that neither the file nor the options tell, and
+            if no step is left.
+
+    Example:
+        >>> raw = RawEpisode(
+        ...     observations={"x": np.zeros((5, 3))}, actions=np.zeros((5, 2)), rewards=np.ones(5)
+        ... )
+        >>> episode = complete("lift.hdf5", "demo_0", raw, ReadOptions())
+        >>> len(episode), episode.left_out.reward
+        (4, 1.0)
+        >>> len(complete("lift.hdf5", "demo_0", raw, ReadOptions(last_step="truncate")))
+        5
+    """
+    steps = len(raw.actions)
+    rewards = _rewards(path, name, raw, options)
+    terminated = np.zeros(steps, bool) if raw.terminated is None else np.asarray(raw.terminated)
+    if raw.terminated is None and options.dones_terminate:
+        if raw.dones is None:
+            message = "missing; valid: dones (T,), or dones_terminate=False"
+            raise DataError(path, f"{name}/dones", message)
+        # Some files mark every step at which the task is solved: the episode goes on there.
+        terminated[-1:] = raw.dones[-1:]
+    before, after, kept = raw.observations, raw.next_observations, steps
+    if after is None and all(len(part) == steps + 1 for part in before.values()):
+        after = {key: part[1:] for key, part in before.items()}
+        before = {key: part[:-1] for key, part in before.items()}
+    elif after is None:
+        if options.last_step == "terminate":
+            terminated = np.append(terminated[:-1], True)
+        if terminated[-1:].any() or options.last_step == "truncate":
+            after = {key: np.append(x[1:], x[-1:], axis=0) for key, x in before.items()}
+        else:
+            after = {key: part[1:] for key, part in before.items()}
+            before = {key: part[:-1] for key, part in before.items()}
+            kept = steps - 1
+    if steps and not kept:
+        message = "a single step, and no observation after it was recorded"
+        raise DataError(path, name, f"{message}; valid: last_step 'truncate' or 'terminate'")
+    extras = {key: array[:kept] for key, array in raw.extras.items()}
+    lost = np.asarray(rewards[kept:], dtype=np.float64)
+    if not np.isfinite(lost).all():
+        raise DataError(path, f"{name}/rewards", f"a value that is not finite in row {kept}")
+    successes = raw.extras.get("successes")
+    return Episode(
+        observations=before,
+        next_observations=after,
+        actions=raw.actions[:kept],
+        rewards=rewards[:kept],
+        terminated=terminated[:kept],
+        extras=extras,
+        attributes=raw.attributes,
+        left_out=LeftOut(
+            steps=steps - kept,
+            reward=float(lost.sum()),
+            success=successes is not None and bool(np.any(successes) > np.any(successes[:kept])),
+            arrays=raw.left_alone,
+        ),
+    )
+
+
+def _rewards(path: str | Path, name: str, raw: RawEpisode, options: ReadOptions) -> np.ndarray:
+    last = np.arange(len(raw.actions)) == len(raw.actions) - 1
+    if options.reward == "last":
+        return last.astype(np.float32)
+    if options.reward == "success":
+        if raw.succeeded is None:
+            message = "neither an attribute success nor successes; valid: reward 'last', or none"
+            raise DataError(path, name, message)
+        return np.asarray(raw.extras.get("successes", last & raw.succeeded), dtype=np.float32)
+    if raw.rewards is None:
+        message = "missing; valid: rewards (T,), or the option reward 'success' or 'last'"
+        raise DataError(path, f"{name}/rewards", message)
+    return raw.rewards
