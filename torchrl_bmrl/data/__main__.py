@@ -1,7 +1,7 @@
 """Command line of the data formats.
 
 python -m torchrl_bmrl.data check FILE
-python -m torchrl_bmrl.data convert SOURCE OUT --to robomimic|minari|lerobot
+python -m torchrl_bmrl.data convert SOURCE [SOURCE ...] OUT --to robomimic|minari|lerobot
 """
 
 from __future__ import annotations
@@ -9,39 +9,52 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
+from typing import Any, get_args
 
 import numpy as np
 from tqdm import tqdm
 
 from torchrl_bmrl.command_line import exit_codes
-from torchrl_bmrl.data.convert import TARGETS, Source, convert, open_source
+from torchrl_bmrl.data.convert import TARGETS, convert
 from torchrl_bmrl.data.episodes import Episode
+from torchrl_bmrl.data.options import LastStep, ReadOptions, Reward
 from torchrl_bmrl.data.robosuite import Relabelling
 from torchrl_bmrl.data.schema import Summary, summarise
+from torchrl_bmrl.data.sources import Source, open_source
 from torchrl_bmrl.names import TASKS
 
 
-def describe(path: Path, source: Source, summary: Summary) -> Iterator[str]:
+def describe(source: Source, summary: Summary) -> Iterator[str]:
     """Lines that tell a reader what a data set holds."""
-    count, steps = len(summary.lengths), sum(summary.lengths)
-    yield f"{path}: {source.format}, {count} episodes, {steps:,} steps"
+    count, account = len(summary.lengths), summary.account
+    yield f"{source.path}: {source.format}, {count} episodes, {sum(summary.lengths):,} steps"
+    if wrong := len(source.episodes) - count:
+        yield f"  not counted       {wrong} episodes in which something is wrong"
     if count:
+        yield f"  in the file       {account.whole}"
+        yield f"  read              {account.read}"
+        left = [str(tally) for tally in (account.cut, account.failed) if tally.steps]
+        yield f"  left out          {' and '.join(left) or 'nothing'}"
         shortest, longest = min(summary.lengths), max(summary.lengths)
         lengths = f"{shortest}" if shortest == longest else f"{shortest} to {longest}"
         returns = np.array(summary.returns)
         yield f"  steps an episode  {lengths}"
         yield (
-            f"  return            {returns.mean():.1f} on average, "
-            f"{returns.min():.1f} to {returns.max():.1f}"
+            f"  return            {returns.mean():.6g} on average, "
+            f"{returns.min():.6g} to {returns.max():.6g}"
         )
-        known = len(summary.successes)
-        success = f"{sum(summary.successes)} of {known}" if known else "not recorded"
+        known, failed = len(summary.successes), summary.failed
+        named = f"; not in {', '.join(failed)}" if failed else ""
+        success = f"{sum(summary.successes)} of {known}{named}" if known else "not recorded"
         yield f"  success           {success}"
         yield (
             f"  ends              {count - summary.terminated} truncated, "
             f"{summary.terminated} terminated"
         )
+    if "action_bounds" in source.metadata:
+        yield f"  action bounds     {source.bounds[0]} to {source.bounds[1]}: the loss's, too"
     for mask, names in source.metadata.get("masks", {}).items():
         yield f"  mask {mask:<12} {len(names)} episodes"
     yield ""
@@ -66,10 +79,16 @@ def describe_relabelling(row: Relabelling) -> str:
     )
 
 
+def reading(options: argparse.Namespace) -> dict[str, Any]:
+    """The options by which a source is read."""
+    names = [field.name for field in fields(ReadOptions)]
+    return {name: getattr(options, name) for name in [*names, "task", "tracking"]}
+
+
 def check(options: argparse.Namespace) -> int:
     """Prints a summary, the warnings and everything that is wrong; 1 if something is."""
     relabelled = []
-    with open_source(options.file, task=options.task, tracking=options.tracking) as source:
+    with open_source(options.file, **reading(options)) as source:
         with tqdm(total=len(source.episodes), unit="episode", delay=2, leave=False) as bar:
 
             def look(name: str, episode: Episode | None) -> None:
@@ -78,11 +97,16 @@ def check(options: argparse.Namespace) -> int:
                 bar.update()
 
             summary = summarise(
-                source.episodes, prefix=source.prefix, bounds=source.bounds, look=look
+                source.episodes,
+                prefix=source.prefix,
+                bounds=source.bounds,
+                account=source.account,
+                options=source.options,
+                look=look,
             )
         summary.problems = [*source.problems, *summary.problems]
         summary.warnings = [*source.oddities, *summary.warnings]
-        print("\n".join(describe(options.file, source, summary)))
+        print("\n".join(describe(source, summary)))
     if relabelled:
         print("\n".join([RELABELLED, *relabelled]))
     for warning in summary.warnings:
@@ -97,49 +121,97 @@ def check(options: argparse.Namespace) -> int:
 def convert_command(options: argparse.Namespace) -> int:
     """Converts under a progress bar."""
     with tqdm(unit="episode", delay=2, leave=False) as bar:
-        convert(
+        done = convert(
             options.source,
             options.out,
             to=options.to,
-            task=options.task,
-            tracking=options.tracking,
-            split=options.split,
             fps=options.fps,
             report=bar.update,
+            **reading(options),
         )
-    print(f"{options.out}: {options.to}, {bar.n} episodes")
+    print(f"{options.out}: {options.to}, {done.account.read}")
+    for note in done.notes:
+        print(f"warning: {note}")
     return 0
+
+
+def reading_options() -> argparse.ArgumentParser:
+    """Parser of the options that all commands share."""
+    parser = argparse.ArgumentParser(add_help=False)
+    group = parser.add_argument_group("how the source is read")
+    group.add_argument("--split", help="one mask's episodes (robomimic's layout)")
+    group.add_argument(
+        "--observation-keys", nargs="+", metavar="KEY", help="parts of the observation; else all"
+    )
+    group.add_argument(
+        "--last-step",
+        choices=get_args(LastStep),
+        help="what becomes of a last step after which no observation was recorded: leave it out, "
+        "or keep it, repeat its observation and bootstrap (truncate) or not (terminate)",
+    )
+    group.add_argument(
+        "--dones-terminate", action="store_true", help="dones at the last step is a termination"
+    )
+    group.add_argument(
+        "--reward",
+        choices=get_args(Reward),
+        help="1 where the episode succeeded, or at each last step, in place of the file's rewards",
+    )
+    group.add_argument(
+        "--successful", action="store_true", help="leave out the episodes that did not succeed"
+    )
+    group.add_argument(
+        "--bounds",
+        nargs="+",
+        type=_number_or_data,
+        action=_Bounds,
+        metavar=("LOW", "HIGH"),
+        help="of actions, or `data` for their range; else what the source states, or -1 1",
+    )
+    group.add_argument(
+        "--task", choices=TASKS, help="the task in whose scene a robosuite demo.hdf5 was recorded"
+    )
+    group.add_argument(
+        "--tracking",
+        type=float,
+        default=1.0,
+        help="share of a commanded delta that the arm covers in one step (robosuite files)",
+    )
+    return parser
+
+
+def _number_or_data(text: str) -> float | str:
+    return text if text == "data" else float(text)
+
+
+class _Bounds(argparse.Action):
+    """Two numbers, or ``data``."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option: Any = None) -> None:
+        pair = len(values) == 2 and "data" not in values
+        if not pair and values != ["data"]:
+            parser.error(f"argument {option}: valid: LOW HIGH, or data")
+        namespace.bounds = tuple(values) if pair else "data"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; an expected error becomes one line and exit code 1."""
     parser = argparse.ArgumentParser(
         prog="python -m torchrl_bmrl.data",
-        description="Demonstrations of robomimic, robosuite, Minari and LeRobot.",
+        description="Demonstrations of robomimic, robosuite, Isaac Lab, Minari, D4RL and LeRobot.",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    shared = argparse.ArgumentParser(add_help=False)
-    shared.add_argument(
-        "--task", choices=TASKS, help="the task in whose scene a robosuite demo.hdf5 was recorded"
-    )
-    shared.add_argument(
-        "--tracking",
-        type=float,
-        default=1.0,
-        help="share of a commanded delta that the arm covers in one step (robosuite files)",
-    )
+    shared = [reading_options()]
+    source = "HDF5 file, or folder of a Minari or LeRobot data set"
     parts = commands.add_parser(
-        "check",
-        parents=[shared],
-        help="what a data set holds, and everything that is wrong with it",
+        "check", parents=shared, help="what a data set holds, and everything that is wrong with it"
     )
-    parts.add_argument("file", type=Path, help="HDF5 file, or folder of a Minari data set")
+    parts.add_argument("file", type=Path, help=source)
     parts.set_defaults(run=check)
-    parts = commands.add_parser("convert", parents=[shared], help="write it in another format")
-    parts.add_argument("source", type=Path, help="HDF5 file, or folder of a Minari data set")
+    parts = commands.add_parser("convert", parents=shared, help="write it in another format")
+    parts.add_argument("source", type=Path, nargs="+", help=f"{source}; several become one")
     parts.add_argument("out", type=Path, help="new file (robomimic) or folder (minari, lerobot)")
     parts.add_argument("--to", choices=TARGETS, required=True)
-    parts.add_argument("--split", help="one mask's episodes of a file in robomimic's layout")
     parts.add_argument("--fps", type=float, help="steps per second, where the source tells none")
     parts.set_defaults(run=convert_command)
     options = parser.parse_args(arguments)

@@ -6,9 +6,11 @@ import hashlib
 import json
 import os
 import shutil
+import warnings
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict
@@ -20,11 +22,13 @@ from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs.transforms import Transform
 
-from torchrl_bmrl.data.episodes import Episode, as_tensordict
-from torchrl_bmrl.data.robomimic import count_steps, open_episodes, read_metadata
+from torchrl_bmrl.data.episodes import as_tensordict
+from torchrl_bmrl.data.options import Bounds, LastStep, ReadOptions, Reward
+from torchrl_bmrl.data.robomimic import count_steps
 from torchrl_bmrl.data.sampler import read_memmap
 from torchrl_bmrl.data.schema import check_episode, layout_of
-from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
+from torchrl_bmrl.data.sources import Source, find_format, open_source
+from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.files import new_folder
 
 LAYOUT_VERSION = 1
@@ -77,6 +81,13 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
         split: name of a mask, such as ``"train"``; ``None`` for all demonstrations.
         observation_keys: parts of the observation; ``None`` for all.
         dones_terminate: ``dones`` at the last step is a termination (files without ``terminated``).
+        last_step: ``"drop"``, ``"truncate"`` or ``"terminate"``: what becomes of a last step after
+            which no observation was recorded.
+        reward: ``"success"`` or ``"last"``: where rewards come from, if not from the file.
+        successful: leaves out the episodes that did not succeed.
+        bounds: ``(low, high)`` of floating-point actions, or ``"data"``; by default those that the
+            file states, else [-1, 1]. :class:`~torchrl_bmrl.data.options.ReadOptions` says more of
+            these options.
         split_trajs: one row per episode, padded with zeros; ``mask`` tells the steps from them.
         sampler: a ``RandomSampler`` by default; ``SliceSampler(traj_key="episode", ...)`` works.
         writer: an ``ImmutableDatasetWriter`` by default.
@@ -115,6 +126,10 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
         split: str | None = None,
         observation_keys: Iterable[str] | None = None,
         dones_terminate: bool = False,
+        last_step: LastStep | None = None,
+        reward: Reward | None = None,
+        successful: bool = False,
+        bounds: Bounds | Literal["data"] | None = None,
         split_trajs: bool = False,
         sampler: Sampler | None = None,
         writer: Writer | None = None,
@@ -123,26 +138,31 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
         prefetch: int | None = None,
         transform: Transform | None = None,
     ) -> None:
-        if isinstance(observation_keys, str):
-            raise ConfigError(f"observation_keys is {observation_keys!r}; valid: a list of names")
-        if not isinstance(split, str | None):
-            raise ConfigError(f"split is {split!r}; valid: the name of a mask, or None")
+        chosen = ReadOptions(
+            split=split,
+            observation_keys=observation_keys,
+            dones_terminate=dones_terminate,
+            last_step=last_step,
+            reward=reward,
+            successful=successful,
+            bounds=bounds,
+        )
         self.dataset_id = str(dataset_id)
         # Absolute: the working directory may change before the folder is looked at again.
         source = Path(dataset_id).expanduser().absolute()
         self.root = source.parent if root is None else Path(root).expanduser().absolute()
-        options = {
-            "split": split,
+        options = asdict(chosen)
+        if chosen.observation_keys is not None:
             # In one order, so that one folder serves them all.
-            "observation_keys": None if observation_keys is None else sorted(set(observation_keys)),
-            "dones_terminate": dones_terminate,
-        }
+            options["observation_keys"] = sorted(chosen.observation_keys)
         self._path = self.root / f"{source.stem}-{_digest(source, options, split_trajs)}"
         if not self._is_downloaded():
             if self._path.exists() and not self._is_downloaded():
                 # Damaged. (Asked twice: another process may just have finished.)
                 shutil.rmtree(self._path, ignore_errors=True)
             _convert(source, self._path, options, split_trajs)
+        for text in self.metadata["warnings"]:
+            warnings.warn(f"{source}: {text}", stacklevel=2)
         data = read_memmap(self._path / "data")
         super().__init__(
             storage=FixedStorage(data),
@@ -202,12 +222,18 @@ def _convert(source: Path, target: Path, options: Mapping[str, Any], split_trajs
     """Converts a file into a folder that appears whole, or not at all."""
     try:
         with new_folder(target, exist_ok=True) as folder:
-            with open_episodes(
-                source, extras=["successes"], attributes=False, **options
-            ) as episodes:
-                steps = count_steps(source, episodes)
-                data = _write_rows(folder / "data", source, episodes, steps)
-                metadata = read_metadata(source) | {"episodes": list(episodes)}
+            if (form := find_format(source)) != "robomimic":
+                raise DataError(source, None, _other_format(source, form))
+            with open_source(source, to_train=True, **options) as data_set:
+                steps = count_steps(source, data_set.episodes)
+                data = _write_rows(folder / "data", data_set, steps)
+                data_set.account.check(source, data_set.options)
+                metadata = dict(data_set.metadata) | {
+                    "episodes": list(data_set.episodes),
+                    "account": data_set.account.as_dict(),
+                    "warnings": list(data_set.account.warnings()),
+                    "oddities": list(data_set.oddities),
+                }
             metadata["statistics"] = _statistics(data)
             if split_trajs:
                 _split(folder / "data")
@@ -227,17 +253,22 @@ def _convert(source: Path, target: Path, options: Mapping[str, Any], split_trajs
         ) from error
 
 
-def _write_rows(
-    path: Path, source: Path, episodes: Mapping[str, Episode], steps: int
-) -> TensorDict:
+def _other_format(source: Path, form: str) -> str:
+    task = " --task TASK" if form == "robosuite" else ""
+    return (
+        f"{form}'s layout; valid: robomimic's, which `python -m torchrl_bmrl.data convert {source} "
+        f"OUT.hdf5 --to robomimic{task}` writes"
+    )
+
+
+def _write_rows(path: Path, source: Source, steps: int) -> TensorDict:
     """Writes episodes one after the other into memory-mapped tensors.
 
     Only one episode is in memory at a time, however large the data set.
 
     Args:
         path: folder of the tensors.
-        source: file, for messages.
-        episodes: by name.
+        source: whose episodes, which its account counts.
         steps: of all of them together.
 
     Raises:
@@ -245,9 +276,10 @@ def _write_rows(
         OSError: if the folder cannot be written or the disk is full.
     """
     layout, start = None, 0
-    for number, name in enumerate(episodes):
-        episode = episodes[name]
-        check_episode(source, f"data/{name}", episode, layout=layout)
+    for number, name in enumerate(source.episodes):
+        episode = source.episodes[name]
+        check_episode(source.path, f"data/{name}", episode, layout=layout, bounds=source.bounds)
+        source.account.add(episode)
         rows = as_tensordict(episode, number=number)
         if layout is None:
             layout = layout_of(episode)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -88,7 +88,10 @@ class Episode:
         return bool(success) if isinstance(success, bool | int) else None
 
 
-class LazyEpisodes(Mapping[str, Episode]):
+E = TypeVar("E")
+
+
+class LazyEpisodes(Mapping[str, E], Generic[E]):
     """Episodes of a file by name, each read when it is asked for.
 
     Args:
@@ -96,11 +99,11 @@ class LazyEpisodes(Mapping[str, Episode]):
         read: reads the episode of a name.
     """
 
-    def __init__(self, names: Iterable[str], read: Callable[[str], Episode]) -> None:
+    def __init__(self, names: Iterable[str], read: Callable[[str], E]) -> None:
         self._names = dict.fromkeys(names)  # in order, and found at once
         self._read = read
 
-    def __getitem__(self, name: str) -> Episode:
+    def __getitem__(self, name: str) -> E:
         if name not in self._names:
             raise KeyError(name)
         return self._read(name)

@@ -32,6 +32,9 @@ def open_file(path: str | Path) -> h5py.File:
         if not pointer:
             return h5py.File(path, "r")
     except DAMAGE as error:
+        if isinstance(error, BlockingIOError):  # HDF5's lock
+            message = "in use: another process has it open for writing; valid: a closed file"
+            raise DataError(path, None, message) from error
         raise DataError(path, None, f"not a whole HDF5 file ({error})") from error
     raise DataError(path, None, "a git-LFS pointer, not the data; `git lfs pull` fetches them")
 
@@ -51,6 +54,20 @@ def read_names(path: str | Path, file: h5py.File, key: str) -> list[str]:
     except DAMAGE as error:
         raise DataError(path, key, f"unreadable ({error})") from error
     raise DataError(path, key, "missing; valid: a group" if group is None else "not a group")
+
+
+def read_node(path: str | Path, file: h5py.File, key: str) -> Any:
+    """A group or dataset; ``None`` where there is none.
+
+    Raises:
+        DataError: if it cannot be read, or lies in another file.
+    """
+    try:
+        return _within(path, file, key)
+    except DataError:
+        raise
+    except DAMAGE as error:
+        raise DataError(path, key, f"unreadable ({error})") from error
 
 
 def _within(path: str | Path, file: h5py.File, key: str) -> Any:
@@ -125,6 +142,18 @@ def read_attributes(path: str | Path, file: h5py.File, key: str) -> dict[str, An
         return {name: _plain(value) for name, value in file[key].attrs.items()}
     except DAMAGE as error:
         raise DataError(path, key, f"attributes unreadable ({error})") from error
+
+
+def read_attribute(path: str | Path, file: h5py.File, key: str, name: str) -> Any:
+    """One attribute of a group, as :func:`read_attributes` gives it; ``None`` without it.
+
+    Raises:
+        DataError: if it cannot be read.
+    """
+    try:
+        return _plain(file[key].attrs.get(name))
+    except DAMAGE as error:
+        raise DataError(path, key, f"attribute {name} unreadable ({error})") from error
 
 
 def write_attributes(group: h5py.Group, attributes: Mapping[str, Any]) -> None:

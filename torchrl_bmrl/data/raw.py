@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +86,7 @@ def complete(path: str | Path, name: str, raw: RawEpisode, options: ReadOptions)
         # Some files mark every step at which the task is solved: the episode goes on there.
         terminated[-1:] = raw.dones[-1:]
     before, after, kept = raw.observations, raw.next_observations, steps
-    if after is None and all(len(part) == steps + 1 for part in before.values()):
+    if after is None and before and all(len(part) == steps + 1 for part in before.values()):
         after = {key: part[1:] for key, part in before.items()}
         before = {key: part[:-1] for key, part in before.items()}
     elif after is None:
@@ -101,25 +101,40 @@ def complete(path: str | Path, name: str, raw: RawEpisode, options: ReadOptions)
     if steps and not kept:
         message = "a single step, and no observation after it was recorded"
         raise DataError(path, name, f"{message}; valid: last_step 'truncate' or 'terminate'")
-    extras = {key: array[:kept] for key, array in raw.extras.items()}
-    lost = np.asarray(rewards[kept:], dtype=np.float64)
-    if not np.isfinite(lost).all():
-        raise DataError(path, f"{name}/rewards", f"a value that is not finite in row {kept}")
-    successes = raw.extras.get("successes")
-    return Episode(
+    whole = Episode(
         observations=before,
         next_observations=after,
-        actions=raw.actions[:kept],
-        rewards=rewards[:kept],
-        terminated=terminated[:kept],
-        extras=extras,
+        actions=raw.actions,
+        rewards=rewards,
+        terminated=terminated,
+        extras=raw.extras,
         attributes=raw.attributes,
-        left_out=LeftOut(
-            steps=steps - kept,
-            reward=float(lost.sum()),
-            success=successes is not None and bool(np.any(successes) > np.any(successes[:kept])),
-            arrays=raw.left_alone,
-        ),
+        left_out=LeftOut(arrays=raw.left_alone),
+    )
+    # Uncut, the arrays may differ in their lengths: whoever checks the episode is to see it.
+    return whole if kept == steps else _cut(path, name, whole, kept)
+
+
+def _cut(path: str | Path, name: str, episode: Episode, kept: int) -> Episode:
+    """All but the last step of an episode whose observations have been cut already."""
+    lost = np.asarray(episode.rewards[kept:], dtype=np.float64)
+    if not np.isfinite(lost).all():
+        raise DataError(path, f"{name}/rewards", f"a value that is not finite in row {kept}")
+    extras = {key: array[:kept] for key, array in episode.extras.items()}
+    successes = episode.extras.get("successes", np.zeros(kept, bool))
+    left_out = LeftOut(
+        steps=len(episode) - kept,
+        reward=float(lost.sum()),
+        success=bool(np.any(successes)) and not np.any(successes[:kept]),
+        arrays=episode.left_out.arrays,
+    )
+    return replace(
+        episode,
+        actions=episode.actions[:kept],
+        rewards=episode.rewards[:kept],
+        terminated=episode.terminated[:kept],
+        extras=extras,
+        left_out=left_out,
     )
 
 

@@ -20,300 +20,44 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
-from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
-from torchrl_bmrl.data.hdf5 import (
-    DAMAGE,
-    open_file,
-    read_array,
-    read_attributes,
-    read_names,
-    read_strings,
-    write_attributes,
+from torchrl_bmrl.data.episodes import Episode
+from torchrl_bmrl.data.hdf5 import DAMAGE, write_attributes
+from torchrl_bmrl.data.options import Bounds, check_bounds
+from torchrl_bmrl.data.robomimic_reader import (
+    MASKS,
+    STEP_KEYS,
+    count_episodes,
+    count_steps,
+    find_mask_problems,
+    find_oddities,
+    open_episodes,
+    open_raw,
+    read_metadata,
 )
 from torchrl_bmrl.data.schema import check_episode, layout_of
 from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.files import atomic_path, write_atomic
 
-MASKS = ("train", "valid")
-STEP_KEYS = ("actions", "rewards", "dones", "terminated", "obs", "next_obs")
-
-
-@contextmanager
-def open_episodes(
-    path: str | Path,
-    *,
-    split: str | None = None,
-    observation_keys: Iterable[str] | None = None,
-    extras: Iterable[str] | None = None,
-    dones_terminate: bool = False,
-    attributes: bool = True,
-) -> Iterator[Mapping[str, Episode]]:
-    """Episodes of a file by name, each read when it is asked for.
-
-    Args:
-        path: the HDF5 file; it is only read.
-        split: name of a mask, such as ``"train"``; ``None`` for all.
-        observation_keys: parts of the observation to read; ``None`` for all.
-        extras: further arrays to read, those of them that are there; ``None`` for all that have a
-            row of numbers for each step.
-        dones_terminate: what ``dones`` means at the last step of files without ``terminated``:
-            robomimic's simulators never terminate, so that by default an episode's end truncates.
-        attributes: whether to read those of the demonstrations.
-
-    Files without ``next_obs`` take the next step's ``obs``. Their last step is left out, unless it
-    terminates: then what follows does not matter, and its own ``obs`` stands for it.
-
-    Raises:
-        DataError: naming file and key, for a missing or damaged file, a mask that is missing or
-            names a demonstration that is, and, when an episode is read, for missing keys.
-        ConfigError: if ``observation_keys`` is one text.
-
-    Example:
-        >>> import tempfile
-        >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.zeros(5)
-        >>> episode = Episode(
-        ...     observations=x, next_observations=x, actions=a, rewards=r, terminated=r > 0
-        ... )
-        >>> path = Path(tempfile.mkdtemp()) / "lift.hdf5"
-        >>> write_episodes(path, [episode] * 3, env_args={}, masks={"valid": [2]})
-        >>> with open_episodes(path, split="valid") as episodes:
-        ...     {name: len(episode) for name, episode in episodes.items()}
-        {'demo_2': 5}
-    """
-    if isinstance(observation_keys, str):
-        raise ConfigError(f"observation_keys is {observation_keys!r}; valid: a list of names")
-    parts = None if observation_keys is None else list(observation_keys)
-    wanted = None if extras is None else set(extras)
-    with open_file(path) as file:
-
-        def read(name: str) -> Episode:
-            episode = _read_episode(path, file, f"data/{name}", parts, wanted, dones_terminate)
-            if not attributes:
-                return episode
-            told = read_attributes(path, file, f"data/{name}")
-            told.pop("num_samples", None)
-            return replace(episode, attributes=told)
-
-        yield LazyEpisodes(episode_names(path, file, split), read)
-
-
-def episode_names(path: str | Path, file: h5py.File, split: str | None) -> list[str]:
-    """Names of all demonstrations, or of a mask's.
-
-    Raises:
-        DataError: if there are none, or the mask is missing or names one that is.
-    """
-    names = read_names(path, file, "data")
-    if split is not None:
-        masks = _read_masks(path, file)
-        if split not in masks:
-            valid = ", ".join(masks) or "none; the file has no masks"
-            raise DataError(path, f"mask/{split}", f"missing; valid masks: {valid}")
-        names = _read_mask(path, file, split, set(names))
-    if not names:
-        raise DataError(path, f"mask/{split}" if split else "data", "no demonstrations")
-    return names
-
-
-def _read_mask(path: str | Path, file: h5py.File, mask: str, known: set[str]) -> list[str]:
-    names = read_strings(path, file, f"mask/{mask}")
-    seen: set[str] = set()
-    for row, name in enumerate(names):
-        if name not in known or name in seen:
-            fault = "again" if name in known else "which is not in the file"
-            raise DataError(path, f"mask/{mask}", f"row {row} names {name!r}, {fault}")
-        seen.add(name)
-    return names
-
-
-def find_mask_problems(path: str | Path) -> list[tuple[str, str]]:
-    """What is wrong with each mask of a file: key and message."""
-    problems = []
-    with open_file(path) as file:
-        known = set(read_names(path, file, "data"))
-        for mask in _read_masks(path, file):
-            try:
-                _read_mask(path, file, mask, known)
-            except DataError as error:
-                problems.append((error.key or "mask", error.message))
-    return problems
-
-
-def find_oddities(path: str | Path) -> list[str]:
-    """What deserves a look in a file beside its episodes: warnings."""
-    oddities = []
-    with open_file(path) as file:
-        names = read_names(path, file, "data")
-        cut = [name for name in names if "next_obs" not in read_names(path, file, f"data/{name}")]
-        if cut:
-            oddities.append(
-                f"{len(cut)} episodes have no next_obs, such as {cut[0]}: where they do not "
-                "terminate, their last step is left out"
-            )
-        present = _read_masks(path, file)
-        if set(MASKS) <= set(present):
-            train, valid = (set(read_strings(path, file, f"mask/{mask}")) for mask in MASKS)
-            if both := sorted(train & valid):
-                oddities.append(
-                    f"{len(both)} episodes are in train and in valid, such as {both[0]}"
-                )
-    return oddities
-
-
-def _read_masks(path: str | Path, file: h5py.File) -> list[str]:
-    return read_names(path, file, "mask") if "mask" in read_names(path, file, "/") else []
-
-
-def _read_episode(
-    path: str | Path,
-    file: h5py.File,
-    demo: str,
-    parts: list[str] | None,
-    extras: set[str] | None,
-    dones_terminate: bool,
-) -> Episode:
-    present = read_names(path, file, demo)
-    if parts is None:
-        parts = read_names(path, file, f"{demo}/obs")
-    else:
-        valid = read_names(path, file, f"{demo}/obs")
-        for part in parts:
-            if part not in valid:
-                raise DataError(path, f"{demo}/obs/{part}", f"missing; valid: {', '.join(valid)}")
-    observations = {part: read_array(path, file, f"{demo}/obs/{part}") for part in parts}
-    actions = read_array(path, file, f"{demo}/actions")
-    if not actions.ndim:
-        raise DataError(path, f"{demo}/actions", "one number; valid: (T, action_dim)")
-    wanted = [
-        key
-        for key in present
-        if key not in STEP_KEYS
-        and (
-            _is_extra(path, file, f"{demo}/{key}", len(actions))
-            if extras is None
-            else key in extras
-        )
-    ]
-    steps: dict[str, np.ndarray] = {"actions": actions}
-    steps["rewards"] = read_array(path, file, f"{demo}/rewards")
-    if "terminated" in present:
-        steps["terminated"] = _read_flags(path, file, f"{demo}/terminated")
-    else:
-        steps["terminated"] = np.zeros(actions.shape[:1], dtype=bool)
-        if dones_terminate:
-            dones = _read_flags(path, file, f"{demo}/dones")
-            if dones.shape != actions.shape[:1]:
-                message = f"shape {dones.shape}; valid: {actions.shape[:1]}"
-                raise DataError(path, f"{demo}/dones", message)
-            # Some files mark every step at which the task is solved: the episode goes on there.
-            steps["terminated"][-1:] = dones[-1:]
-    steps |= {key: read_array(path, file, f"{demo}/{key}") for key in wanted}
-    if "next_obs" in present:
-        after = {part: read_array(path, file, f"{demo}/next_obs/{part}") for part in parts}
-    else:
-        for key, array in {**steps, **observations}.items():
-            if not array.ndim:
-                raise DataError(path, f"{demo}/{key}", "one number; valid: a row for each step")
-        if steps["terminated"][-1:].any():
-            after = {part: np.append(x[1:], x[-1:], axis=0) for part, x in observations.items()}
-        else:
-            after = {part: array[1:] for part, array in observations.items()}
-            observations = {part: array[:-1] for part, array in observations.items()}
-            steps = {key: array[:-1] for key, array in steps.items()}
-    return Episode(
-        observations=observations,
-        next_observations=after,
-        actions=steps.pop("actions"),
-        rewards=steps.pop("rewards"),
-        terminated=steps.pop("terminated"),
-        extras=steps,
-    )
-
-
-def _is_extra(path: str | Path, file: h5py.File, key: str, steps: int) -> bool:
-    """Whether it has a row of numbers for each step; other tools keep all sorts of things."""
-    if key.endswith("/successes"):  # this library's own: damage to them is not left alone
-        return True
-    try:
-        node = file[key]
-        if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "biuf":
-            return False
-        return node.shape[:1] == (steps,)
-    except DAMAGE as error:
-        raise DataError(path, key, f"unreadable ({error})") from error
-
-
-def _read_flags(path: str | Path, file: h5py.File, key: str) -> np.ndarray:
-    flags = read_array(path, file, key)
-    wrong = np.flatnonzero((flags != 0) & (flags != 1))
-    if len(wrong):
-        raise DataError(path, key, f"{flags.flat[wrong[0]]} in row {wrong[0]}; valid: 0 or 1")
-    return flags.astype(bool)
-
-
-def read_metadata(path: str | Path) -> dict[str, Any]:
-    """Attributes of a file, ``env_args`` parsed, and its masks.
-
-    Returns:
-        the attributes by name, and ``masks``: names of demonstrations by mask.
-
-    Raises:
-        DataError: if the file is missing or damaged, or ``env_args`` is not JSON.
-    """
-    with open_file(path) as file:
-        read_names(path, file, "data")
-        attributes = read_attributes(path, file, "data")
-        masks = _read_masks(path, file)
-        attributes["masks"] = {name: read_strings(path, file, f"mask/{name}") for name in masks}
-    try:
-        attributes["env_args"] = json.loads(attributes.get("env_args", "{}"))
-    except (TypeError, ValueError) as error:
-        raise DataError(path, "data", f"attribute env_args is not JSON ({error})") from error
-    if not isinstance(attributes["env_args"], dict):
-        raise DataError(path, "data", "attribute env_args; valid: a JSON object")
-    return attributes
-
-
-def count_episodes(path: str | Path) -> int:
-    """Number of demonstrations in a file.
-
-    Raises:
-        DataError: if the file is missing, damaged or has no ``data`` group.
-    """
-    with open_file(path) as file:
-        return len(read_names(path, file, "data"))
-
-
-def count_steps(path: str | Path, episodes: Mapping[str, Episode]) -> int:
-    """Steps of the episodes of a file together, without reading what need not be read.
-
-    Args:
-        path: the file.
-        episodes: of :func:`open_episodes`.
-
-    Raises:
-        DataError: if the file is damaged or lacks the actions of one.
-    """
-    total = 0
-    with open_file(path) as file:
-        for name in episodes:
-            key = f"data/{name}/actions"
-            try:
-                whole = "next_obs" in file[f"data/{name}"]
-                total += len(file[key]) if whole else 0
-            except DAMAGE as error:
-                raise DataError(path, key, f"missing or unreadable ({error})") from error
-            total += 0 if whole else len(episodes[name])
-    return total
+__all__ = [
+    "MASKS",
+    "count_episodes",
+    "count_steps",
+    "find_mask_problems",
+    "find_oddities",
+    "keep_episode",
+    "open_episodes",
+    "open_raw",
+    "read_kept_episode",
+    "read_metadata",
+    "write_episodes",
+]
 
 
 def write_episodes(
@@ -323,6 +67,7 @@ def write_episodes(
     env_args: Mapping[str, Any],
     attributes: Mapping[str, str | int | float] | None = None,
     masks: Mapping[str, Iterable[int]] | None = None,
+    bounds: Bounds = (-1.0, 1.0),
 ) -> None:
     """Writes a whole file, or leaves none.
 
@@ -335,6 +80,8 @@ def write_episodes(
             ``env_kwargs``.
         attributes: further attributes of ``data``.
         masks: positions of the episodes of each mask, such as ``{"train": range(60)}``.
+        bounds: of floating-point actions; other ones than [-1, 1] are kept in the attribute
+            ``action_bounds`` of ``data``, and readers of this library take them from there.
 
     Raises:
         DataError: for an episode that could not be trained on, without episodes, and if an extra is
@@ -353,6 +100,7 @@ def write_episodes(
         >>> read_metadata(path)["masks"]
         {'train': ['demo_0', 'demo_1']}
     """
+    bounds = check_bounds(bounds)
     # HDF5's default structures have no checksums, these have; "latest" could only be read by the
     # very version that wrote it.
     version = ("v110", "v110")
@@ -364,13 +112,15 @@ def write_episodes(
         for i, episode in enumerate(episodes):
             names.append(f"demo_{i}")
             _check_names(path, f"data/{names[-1]}", episode)
-            check_episode(path, f"data/{names[-1]}", episode, layout=layout)
+            check_episode(path, f"data/{names[-1]}", episode, layout=layout, bounds=bounds)
             layout = layout or layout_of(episode)
             _write_episode(data.create_group(names[-1]), episode)
             total += len(episode)
         if not names:
             raise DataError(path, None, "no episodes; valid: at least one")
         texts = {"env_args": json.dumps(dict(env_args))}
+        if bounds != (-1.0, 1.0):
+            texts["action_bounds"] = json.dumps({"low": bounds[0], "high": bounds[1]})
         write_attributes(data, {"total": total, **texts, **(attributes or {})})
         for name, positions in (masks or {}).items():
             # Not as file["mask/..."]: a group made on the way carries the time of day.

@@ -182,8 +182,6 @@ def _find_scene(recording: Recording, model: mujoco.MjModel, *, cube: bool) -> _
     import mujoco
 
     joints = [model.joint(i).name for i in range(model.njnt)]
-    # The cube's joint has been called cube, cube_jnt0 and cube_joint0.
-    joints = ["cube" if name.startswith("cube") else name for name in joints]
     bodies = [model.body(i).name for i in range(model.nbody)]
     geoms = [model.geom(i).name for i in range(model.ngeom)]
     data = mujoco.MjData(model)
@@ -192,7 +190,7 @@ def _find_scene(recording: Recording, model: mujoco.MjModel, *, cube: bool) -> _
     columns: dict[str, list[int]] = {}
     boxes: list[int] = []
     for name in (*JOINTS, "cube") if cube else JOINTS:
-        joint = _only(recording, "joint", name, joints)
+        joint = _only(recording, "joint", name, joints, at_start=name == "cube")
         positions, velocities = (7, 6) if name == "cube" else (1, 1)
         first, second = 1 + model.jnt_qposadr[joint], 1 + model.nq + model.jnt_dofadr[joint]
         columns[name] = [*range(first, first + positions), *range(second, second + velocities)]
@@ -215,12 +213,16 @@ def _find_scene(recording: Recording, model: mujoco.MjModel, *, cube: bool) -> _
     )
 
 
-def _only(recording: Recording, kind: str, ending: str, names: list[str]) -> int:
-    """Index of the one name that ends like this."""
-    found = [i for i, name in enumerate(names) if name.endswith(ending)]
+def _only(
+    recording: Recording, kind: str, name: str, names: list[str], *, at_start: bool = False
+) -> int:
+    """Index of the one name that ends like this or, ``at_start``, begins so."""
+    found = [i for i, given in enumerate(names) if given.endswith(name)]
+    if at_start:  # cube, cube_jnt0 and cube_joint0
+        found = [i for i, given in enumerate(names) if given.startswith(name)]
     if len(found) != 1:
-        there = ", ".join(name for name in names if name)
-        raise recording.error(f"its model has {len(found)} x {kind} ...{ending}; there: {there}")
+        there = ", ".join(given for given in names if given)
+        raise recording.error(f"its model has {len(found)} x {kind} ...{name}; there: {there}")
     return found[0]
 
 

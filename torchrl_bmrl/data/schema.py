@@ -10,7 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from torchrl_bmrl.data.account import Account
 from torchrl_bmrl.data.episodes import RESERVED, Episode
+from torchrl_bmrl.data.options import Bounds, ReadOptions
 from torchrl_bmrl.errors import ConfigError, DataError
 
 OBSERVATION_SHAPES: dict[str, int] = {
@@ -30,7 +32,6 @@ SATURATED = 0.999
 FLOAT32 = float(np.finfo(np.float32).max)
 
 Layout = dict[str, tuple[tuple[int, ...], np.dtype]]
-Bounds = tuple[float, float]
 
 
 def arrays_of(episode: Episode) -> dict[str, np.ndarray]:
@@ -80,7 +81,7 @@ def find_problems(
         ...     terminated=np.zeros(4, bool),
         ... )
         >>> list(find_problems(episode))
-        [('actions', '2.0 in row 0 is outside [-1.0, 1.0]')]
+        [('actions', '2.0 in row 0 is outside [-1.0, 1.0]; the option bounds takes others')]
     """
     arrays = arrays_of(episode)
     # Where one array differs from all others, it is the one at fault, even if it is the actions.
@@ -119,15 +120,28 @@ def find_problems(
             )
     yield from _flag_problems(episode, steps)
     if bounds is not None and episode.actions.dtype.kind == "f" and episode.actions.ndim:
-        outside = np.argwhere(
-            (episode.actions < bounds[0] - ACTION_TOLERANCE)
-            | (episode.actions > bounds[1] + ACTION_TOLERANCE)
-        )
-        if len(outside):
-            value = float(episode.actions[tuple(outside[0])])
-            # Infinite ones are reported above.
-            if np.isfinite(value):
-                yield "actions", f"{value} in row {outside[0][0]} is outside {list(bounds)}"
+        yield from _bound_problems(episode.actions, bounds)
+
+
+def _bound_problems(actions: np.ndarray, bounds: Bounds) -> Iterator[tuple[str, str]]:
+    low, high = (np.asarray(bound, dtype=np.float64) for bound in bounds)
+    for bound in (low, high):
+        if bound.ndim and bound.shape != actions.shape[1:]:
+            yield "actions", f"shape {actions.shape}, and bounds of {bound.shape[0]} dimensions"
+            return
+    slack = ACTION_TOLERANCE * np.maximum(1, np.maximum(np.abs(low), np.abs(high)))
+    outside = np.argwhere((actions < low - slack) | (actions > high + slack))
+    if len(outside):
+        where = tuple(outside[0])
+        value = float(actions[where])
+        # Infinite ones are reported above.
+        if np.isfinite(value):
+            valid = list(bounds)
+            if low.ndim or high.ndim:
+                ends = (np.broadcast_to(bound, actions.shape[1:]) for bound in (low, high))
+                valid = [float(end[where[1:]]) for end in ends]
+            hint = "" if bounds != (-1.0, 1.0) else "; the option bounds takes others"
+            yield "actions", f"{value} in row {where[0]} is outside {valid}{hint}"
 
 
 def _array_problem(key: str, array: np.ndarray, steps: int, *, trained: bool) -> str | None:
@@ -251,6 +265,8 @@ class Summary:
         lengths: steps of each whole episode.
         returns: undiscounted sum of rewards of each.
         successes: whether each succeeded at some step; empty where the file does not say.
+        failed: names of those that did not.
+        account: what was read, and what was left out.
         terminated: episodes that end by termination; the others are truncated.
         ranges: of the actions and of each part of the observation.
         problems: what keeps the data from being trained on: key and message.
@@ -260,6 +276,8 @@ class Summary:
     lengths: list[int] = field(default_factory=list)
     returns: list[float] = field(default_factory=list)
     successes: list[bool] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+    account: Account = field(default_factory=Account)
     terminated: int = 0
     ranges: dict[str, Extent] = field(default_factory=dict)
     problems: list[tuple[str, str]] = field(default_factory=list)
@@ -271,6 +289,8 @@ def summarise(
     *,
     prefix: str = "",
     bounds: Bounds | None = (-1.0, 1.0),
+    account: Account | None = None,
+    options: ReadOptions | None = None,
     look: Callable[[str, Episode | None], object] = lambda name, episode: None,
 ) -> Summary:
     """Looks at every episode; nothing that is wrong stops it.
@@ -279,9 +299,11 @@ def summarise(
         episodes: by name; reading one may raise a DataError, which becomes a problem.
         prefix: of the names, for messages.
         bounds: of floating-point actions; ``None`` for any.
+        account: what is left out already; the episodes are added to it.
+        options: by which the episodes are read.
         look: called with every name and its episode, ``None`` where it cannot be read.
     """
-    summary = Summary()
+    summary = Summary(account=account or Account())
     layout: Layout | None = None
     seen: dict[str, list[str]] = {}
     jumps: list[str] = []
@@ -294,16 +316,24 @@ def summarise(
             continue
         problems = list(find_problems(episode, layout=layout, bounds=bounds))
         summary.problems += [(f"{prefix}{name}/{key}", message) for key, message in problems]
+        _add_ranges(summary, episode)
         if not problems:
             layout = layout or layout_of(episode)
-            _add(summary, episode)
+            _add(summary, name, episode)
             seen.setdefault(_digest(episode), []).append(name)
             if not is_continuous(episode):
                 jumps.append(name)
         look(name, episode)
     if not len(episodes):
         summary.problems.append((prefix.rstrip("/"), "no episodes; valid: at least one"))
-    summary.warnings = [*_warnings(summary, bounds), *_repeats(seen), *_jumps(jumps)]
+    if refusal := summary.account.refusal(options or ReadOptions()):
+        summary.problems.append(refusal)
+    summary.warnings = [
+        *summary.account.warnings(),
+        *_warnings(summary, bounds),
+        *_repeats(seen),
+        *_jumps(jumps),
+    ]
     return summary
 
 
@@ -315,17 +345,26 @@ def is_continuous(episode: Episode) -> bool:
     )
 
 
-def _add(summary: Summary, episode: Episode) -> None:
+def _add(summary: Summary, name: str, episode: Episode) -> None:
+    summary.account.add(episode)
     summary.lengths.append(len(episode))
     summary.returns.append(float(episode.rewards.sum(dtype=np.float64)))
     summary.terminated += int(episode.terminated[-1])
-    if "successes" in episode.extras:
-        summary.successes.append(bool(episode.extras["successes"].any()))
-    for key, array in {"actions": episode.actions, **episode.observations}.items():
-        if key in summary.ranges:
-            summary.ranges[key].include(Extent.of(array))
-        else:
-            summary.ranges[key] = Extent.of(array)
+    if (succeeded := episode.succeeded) is not None:
+        summary.successes.append(succeeded)
+        summary.failed += [] if succeeded else [name]
+
+
+def _add_ranges(summary: Summary, episode: Episode) -> None:
+    """Includes what can be compared, even where it is out of range, which the ranges then show."""
+    for name, array in {"actions": episode.actions, **episode.observations}.items():
+        if array.dtype.kind not in "biuf" or not array.ndim or 0 in array.shape:
+            continue
+        known = summary.ranges.get(name)
+        if known is None:
+            summary.ranges[name] = Extent.of(array)
+        elif np.shape(known.low) == array.shape[1:]:
+            known.include(Extent.of(array))
 
 
 def _digest(episode: Episode) -> str:
@@ -351,7 +390,7 @@ def _warnings(summary: Summary, bounds: Bounds | None) -> Iterator[str]:
     actions = summary.ranges.get("actions")
     if actions is None or not actions.dtype.startswith("float"):
         return
-    share = np.atleast_1d(actions.saturated / steps)
+    share = np.atleast_1d(actions.saturated / max(1, steps))
     # A dimension that is nowhere else has two commands, such as a gripper's.
     for i in np.flatnonzero((share > 0.5) & (share < 1)):
         yield f"actions: dimension {i} is at ±1 in {share[i]:.0%} of all steps"

@@ -1,0 +1,5 @@
+"""stub"""
+
+
+def is_d4rl(path, file):
+    return False

@@ -1,0 +1,484 @@
+"""Demonstrations in robomimic's HDF5 layout, and what other tools make of it, read.
+
+MimicGen, LIBERO, RoboCasa and Isaac Lab write the same layout with parts of their own, and without
+others: no ``next_obs``, no ``rewards``, an attribute ``success`` in place of an array, groups below
+``obs``. What this library has no use for is left alone, and named.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
+from torchrl_bmrl.data.hdf5 import (
+    DAMAGE,
+    open_file,
+    read_array,
+    read_attribute,
+    read_attributes,
+    read_names,
+    read_node,
+    read_strings,
+)
+from torchrl_bmrl.data.options import ReadOptions, check_bounds
+from torchrl_bmrl.data.raw import RawEpisode, complete
+from torchrl_bmrl.errors import ConfigError, DataError
+
+MASKS = ("train", "valid")
+STEP_KEYS = ("actions", "rewards", "dones", "terminated", "obs", "next_obs")
+
+
+@contextmanager
+def open_episodes(
+    path: str | Path,
+    *,
+    extras: Iterable[str] | None = None,
+    attributes: bool = True,
+    **options: Any,
+) -> Iterator[Mapping[str, Episode]]:
+    """Episodes of a file by name, each read when it is asked for.
+
+    Args:
+        path: the HDF5 file; it is only read.
+        extras: further arrays to read, those of them that are there; ``None`` for all that have a
+            row of numbers for each step.
+        attributes: whether to read those of the demonstrations.
+        options: see :class:`~torchrl_bmrl.data.options.ReadOptions`: ``split``,
+            ``observation_keys``, ``dones_terminate``, ``last_step``, ``reward``. Which episodes
+            succeeded and the bounds of actions are for whoever reads the episodes to look at.
+
+    Files without ``next_obs`` take the next step's ``obs``, and where ``obs`` has one row more than
+    there are actions, its last. Otherwise ``last_step`` says what becomes of the last step.
+
+    Raises:
+        DataError: naming file and key, for a missing or damaged file, a mask that is missing or
+            names a demonstration that is, and, when an episode is read, for missing keys.
+        ConfigError: for invalid options.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl_bmrl.data.robomimic import write_episodes
+        >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.zeros(5)
+        >>> episode = Episode(
+        ...     observations=x, next_observations=x, actions=a, rewards=r, terminated=r > 0
+        ... )
+        >>> path = Path(tempfile.mkdtemp()) / "lift.hdf5"
+        >>> write_episodes(path, [episode] * 3, env_args={}, masks={"valid": [2]})
+        >>> with open_episodes(path, split="valid") as episodes:
+        ...     {name: len(episode) for name, episode in episodes.items()}
+        {'demo_2': 5}
+    """
+    chosen = ReadOptions(**options)
+    with open_raw(path, chosen, extras=extras, attributes=attributes) as raw:
+
+        def read(name: str) -> Episode:
+            return complete(path, f"data/{name}", raw[name], chosen)
+
+        yield LazyEpisodes(raw, read)
+
+
+@contextmanager
+def open_raw(
+    path: str | Path,
+    options: ReadOptions,
+    *,
+    extras: Iterable[str] | None = None,
+    attributes: bool = True,
+) -> Iterator[Mapping[str, RawEpisode]]:
+    """Episodes of a file by name, as it has them, each read when it is asked for.
+
+    Args and errors are those of :func:`open_episodes`.
+    """
+    wanted = None if extras is None else set(extras)
+    with open_file(path) as file:
+        names = episode_names(path, file, options.split)
+        # Needs a look at every episode: when the first is read.
+        foreign: list[set[str]] = []
+
+        def read(name: str) -> RawEpisode:
+            if options.observation_keys is None and not foreign:
+                foreign.append(_foreign_parts(path, file, names))
+            known = foreign[0] if foreign else set()
+            return _read_raw(path, file, f"data/{name}", options, known, wanted, attributes)
+
+        yield LazyEpisodes(names, read)
+
+
+# -- which episodes there are ----------------------------------------------------------------------
+
+
+def episode_names(path: str | Path, file: h5py.File, split: str | None = None) -> list[str]:
+    """Names of all demonstrations, or of a mask's.
+
+    Raises:
+        DataError: if there are none, or the mask is missing or names one that is.
+    """
+    names, _ = _demonstrations(path, file)
+    if split is not None:
+        masks = read_masks(path, file)
+        if split not in masks:
+            valid = ", ".join(masks) or "none; the file has no masks"
+            raise DataError(path, f"mask/{split}", f"missing; valid masks: {valid}")
+        names = _read_mask(path, file, split, set(names))
+    if not names:
+        raise DataError(path, f"mask/{split}" if split else "data", "no demonstrations")
+    return names
+
+
+def _demonstrations(path: str | Path, file: h5py.File) -> tuple[list[str], list[str]]:
+    """Names of the demonstrations below ``data``, and of what lies beside them."""
+    names: list[str] = []
+    beside: list[str] = []
+    for name in read_names(path, file, "data"):
+        # What is named like one is one, damaged or not.
+        found = name.startswith("demo") or _is_demonstration(path, file, f"data/{name}")
+        (names if found else beside).append(name)
+    return names, beside
+
+
+def _is_demonstration(path: str | Path, file: h5py.File, key: str) -> bool:
+    node = read_node(path, file, key)
+    if not isinstance(node, h5py.Group):
+        return node is None  # damaged: reading it will say so
+    return bool({"actions", "obs", "states"} & set(read_names(path, file, key)))
+
+
+def _read_mask(path: str | Path, file: h5py.File, mask: str, known: set[str]) -> list[str]:
+    names = read_strings(path, file, f"mask/{mask}")
+    seen: set[str] = set()
+    for row, name in enumerate(names):
+        if name not in known or name in seen:
+            fault = "again" if name in known else "which is not in the file"
+            raise DataError(path, f"mask/{mask}", f"row {row} names {name!r}, {fault}")
+        seen.add(name)
+    return names
+
+
+def read_masks(path: str | Path, file: h5py.File) -> list[str]:
+    """Names of a file's masks."""
+    return read_names(path, file, "mask") if "mask" in read_names(path, file, "/") else []
+
+
+def count_episodes(path: str | Path) -> int:
+    """Number of demonstrations in a file.
+
+    Raises:
+        DataError: if the file is missing, damaged or has no ``data`` group.
+    """
+    with open_file(path) as file:
+        return len(_demonstrations(path, file)[0])
+
+
+def count_steps(path: str | Path, episodes: Mapping[str, Episode]) -> int:
+    """Steps of the episodes of a file together, without reading what need not be read.
+
+    Args:
+        path: the file.
+        episodes: of :func:`open_episodes`.
+
+    Raises:
+        DataError: if the file is damaged or lacks the actions of one.
+    """
+    total = 0
+    with open_file(path) as file:
+        for name in episodes:
+            key = f"data/{name}/actions"
+            try:
+                whole = "next_obs" in file[f"data/{name}"]
+                total += len(file[key]) if whole else 0
+            except DAMAGE as error:
+                raise DataError(path, key, f"missing or unreadable ({error})") from error
+            total += 0 if whole else len(episodes[name])
+    return total
+
+
+# -- one episode -----------------------------------------------------------------------------------
+
+
+def _foreign_parts(path: str | Path, file: h5py.File, names: list[str]) -> set[str]:
+    """Names below ``obs`` that are numbers in no episode: groups and texts of other tools."""
+    found: dict[str, bool] = {}
+    for name in names:
+        key = f"data/{name}/obs"
+        if isinstance(read_node(path, file, key), h5py.Group):
+            for part in read_names(path, file, key):
+                found[part] = found.get(part) or _is_numbers(path, file, f"{key}/{part}")
+    return {part for part, numbers in found.items() if not numbers}
+
+
+def _is_numbers(path: str | Path, file: h5py.File, key: str) -> bool:
+    """Whether it is anything but a group or text."""
+    node = read_node(path, file, key)
+    if node is None:  # damaged: reading it will say so
+        return True
+    return isinstance(node, h5py.Dataset) and node.dtype.kind not in "OSU"
+
+
+def _read_raw(
+    path: str | Path,
+    file: h5py.File,
+    demo: str,
+    options: ReadOptions,
+    foreign: set[str],
+    extras: set[str] | None,
+    attributes: bool,
+) -> RawEpisode:
+    present = read_names(path, file, demo)
+    parts, beside = _parts(path, file, f"{demo}/obs", options, foreign)
+    observations = {part: read_array(path, file, key) for part, key in parts.items()}
+    steps = {"actions": read_array(path, file, f"{demo}/actions")}
+    if not steps["actions"].ndim:
+        raise DataError(path, f"{demo}/actions", "one number; valid: (T, action_dim)")
+    if "rewards" in present:
+        steps["rewards"] = read_array(path, file, f"{demo}/rewards")
+    if "terminated" in present:
+        steps["terminated"] = _read_flags(path, file, f"{demo}/terminated")
+    elif options.dones_terminate:
+        steps["dones"] = _read_flags(path, file, f"{demo}/dones")
+    after = None
+    if "next_obs" in present:
+        after = {part: read_array(path, file, _next(key)) for part, key in parts.items()}
+        beside += _not_read(path, file, f"{demo}/next_obs", parts)
+    if "successes" in present and (extras is None or "successes" in extras):
+        steps["successes"] = read_array(path, file, f"{demo}/successes")
+    if after is None:
+        _check_lengths(path, demo, steps, observations, _rows_of_dones(path, file, demo))
+    elif "dones" in steps and steps["dones"].shape != steps["actions"].shape[:1]:
+        message = f"shape {steps['dones'].shape}; valid: {steps['actions'].shape[:1]}"
+        raise DataError(path, f"{demo}/dones", message)
+    further = {key: steps[key] for key in ("successes",) if key in steps}
+    for key in present:
+        if key in STEP_KEYS or key in further:
+            continue
+        if (extras is None or key in extras) and _has_rows(
+            path, file, f"{demo}/{key}", len(steps["actions"])
+        ):
+            further[key] = read_array(path, file, f"{demo}/{key}")
+        elif extras is None:
+            beside.append(key)
+    told = read_attributes(path, file, demo) if attributes else {}
+    told.pop("num_samples", None)
+    return RawEpisode(
+        observations=observations,
+        next_observations=after,
+        actions=steps["actions"],
+        rewards=steps.get("rewards"),
+        terminated=steps.get("terminated"),
+        dones=steps.get("dones"),
+        success=_read_success(path, file, demo),
+        extras=further,
+        attributes=told,
+        left_alone=tuple(beside),
+    )
+
+
+def _parts(
+    path: str | Path, file: h5py.File, key: str, options: ReadOptions, foreign: set[str]
+) -> tuple[dict[str, str], list[str]]:
+    """Keys of the observation's parts by name, and what lies beside them."""
+    if isinstance(read_node(path, file, key), h5py.Dataset):  # Isaac Lab: all terms in one array
+        valid = {"observation": key}
+    else:
+        valid = {part: f"{key}/{part}" for part in read_names(path, file, key)}
+    if options.observation_keys is None:
+        chosen = {part: where for part, where in valid.items() if part not in foreign}
+        return chosen, [f"obs/{part}" for part in valid if part in foreign]
+    for part in options.observation_keys:
+        if part not in valid:
+            raise DataError(path, f"{key}/{part}", f"missing; valid: {', '.join(valid)}")
+    # Left out on request: not worth a word.
+    return {part: valid[part] for part in options.observation_keys}, []
+
+
+def _next(key: str) -> str:
+    demo, _, part = key.partition("/obs")
+    return f"{demo}/next_obs{part}"
+
+
+def _not_read(path: str | Path, file: h5py.File, key: str, parts: Mapping[str, str]) -> list[str]:
+    """What lies below ``next_obs`` and not below ``obs``."""
+    if not isinstance(read_node(path, file, key), h5py.Group):
+        return []
+    before = key.replace("/next_obs", "/obs")
+    known = {*parts, *read_names(path, file, before)}
+    return [f"next_obs/{part}" for part in read_names(path, file, key) if part not in known]
+
+
+def _check_lengths(
+    path: str | Path,
+    demo: str,
+    steps: Mapping[str, np.ndarray],
+    observations: Mapping[str, np.ndarray],
+    others: list[int],
+) -> None:
+    """Compares the arrays of an episode without ``next_obs``, of which a row may be cut.
+
+    Args:
+        path: file, for the message.
+        demo: its key, for the message.
+        steps: arrays of T rows.
+        observations: of T rows, or T + 1.
+        others: numbers of rows of arrays that are not read, and should be T.
+
+    Raises:
+        DataError: naming an array whose rows are not as many as most others'.
+    """
+    keys = {**steps, **{f"obs/{part}": array for part, array in observations.items()}}
+    for key, array in keys.items():
+        if not array.ndim:
+            raise DataError(path, f"{demo}/{key}", "one number; valid: a row for each step")
+    rows = [len(array) for array in observations.values()]
+    # Observations come before each action, or also after the last.
+    likely = Counter([*(len(array) for array in steps.values()), *others])
+    count = max(likely, key=lambda n: (likely[n], rows.count(n), rows.count(n + 1)))
+    longer = bool(rows) and rows.count(count + 1) > rows.count(count)
+    for key, array in keys.items():
+        valid = count + (longer and key.startswith("obs/"))
+        if len(array) != valid:
+            hint = f" or {count + 1}" if key.startswith("obs/") and not longer else ""
+            raise DataError(
+                path,
+                f"{demo}/{key}",
+                f"shape {array.shape}; valid: {valid}{hint} rows, as the other arrays have",
+            )
+
+
+def _rows_of_dones(path: str | Path, file: h5py.File, demo: str) -> list[int]:
+    node = read_node(path, file, f"{demo}/dones")
+    return [len(node)] if isinstance(node, h5py.Dataset) and node.ndim else []
+
+
+def _has_rows(path: str | Path, file: h5py.File, key: str, steps: int) -> bool:
+    """Whether it has a row of numbers for each step; other tools keep all sorts of things."""
+    node = read_node(path, file, key)
+    if node is None:
+        raise DataError(path, key, "unreadable: its name leads nowhere")
+    try:
+        if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "biuf":
+            return False
+        return node.shape[:1] == (steps,)
+    except DAMAGE as error:
+        raise DataError(path, key, f"unreadable ({error})") from error
+
+
+def _read_flags(path: str | Path, file: h5py.File, key: str) -> np.ndarray:
+    flags = read_array(path, file, key)
+    wrong = np.flatnonzero((flags != 0) & (flags != 1))
+    if len(wrong):
+        raise DataError(path, key, f"{flags.flat[wrong[0]]} in row {wrong[0]}; valid: 0 or 1")
+    return flags.astype(bool)
+
+
+def _read_success(path: str | Path, file: h5py.File, demo: str) -> bool | None:
+    """What the attribute ``success`` of a demonstration says, if it has one."""
+    value = read_attribute(path, file, demo, "success")
+    return bool(value) if isinstance(value, bool | int | float) and value in (0, 1) else None
+
+
+# -- the file as a whole ---------------------------------------------------------------------------
+
+
+def read_metadata(path: str | Path) -> dict[str, Any]:
+    """Attributes of a file, ``env_args`` and ``action_bounds`` parsed, and its masks.
+
+    Returns:
+        the attributes by name, and ``masks``: names of demonstrations by mask. Where the file
+        states them, ``action_bounds`` has ``low`` and ``high``, a number or a list of one for each
+        dimension.
+
+    Raises:
+        DataError: if the file is missing or damaged, or ``env_args`` or ``action_bounds`` are not
+            what they should be.
+    """
+    with open_file(path) as file:
+        read_names(path, file, "data")
+        attributes = read_attributes(path, file, "data")
+        masks = read_masks(path, file)
+        attributes["masks"] = {name: read_strings(path, file, f"mask/{name}") for name in masks}
+    attributes["env_args"] = _parse(path, "env_args", attributes.get("env_args", "{}"))
+    if "action_bounds" in attributes:
+        bounds = _parse(path, "action_bounds", attributes["action_bounds"])
+        try:
+            check_bounds((bounds["low"], bounds["high"]), "action_bounds")
+        except (KeyError, ConfigError) as error:
+            message = f"attribute action_bounds is {bounds}; valid: low and high, low < high"
+            raise DataError(path, "data", message) from error
+        attributes["action_bounds"] = bounds
+    return attributes
+
+
+def _parse(path: str | Path, name: str, text: Any) -> dict[str, Any]:
+    try:
+        parsed = json.loads(text)
+    except (TypeError, ValueError) as error:
+        raise DataError(path, "data", f"attribute {name} is not JSON ({error})") from error
+    if not isinstance(parsed, dict):
+        raise DataError(path, "data", f"attribute {name}; valid: a JSON object")
+    return parsed
+
+
+def find_mask_problems(path: str | Path) -> list[tuple[str, str]]:
+    """What is wrong with each mask of a file: key and message."""
+    problems = []
+    with open_file(path) as file:
+        known = set(_demonstrations(path, file)[0])
+        for mask in read_masks(path, file):
+            try:
+                _read_mask(path, file, mask, known)
+            except DataError as error:
+                problems.append((error.key or "mask", error.message))
+    return problems
+
+
+def find_oddities(path: str | Path) -> list[str]:
+    """What deserves a look in a file beside its episodes: warnings."""
+    oddities = []
+    with open_file(path) as file:
+        names, beside = _demonstrations(path, file)
+        others = [name for name in read_names(path, file, "/") if name not in ("data", "mask")]
+        if beside := [*(f"data/{name}" for name in beside), *others]:
+            oddities.append(f"left alone, beside the demonstrations: {', '.join(beside)}")
+        cut = [name for name in names if "next_obs" not in read_names(path, file, f"data/{name}")]
+        if cut:
+            oddities.append(f"{len(cut)} episodes have no next_obs, such as {cut[0]}")
+        oddities += _find_contradictions(path, file, names)
+        present = read_masks(path, file)
+        if set(MASKS) <= set(present):
+            train, valid = (set(read_strings(path, file, f"mask/{mask}")) for mask in MASKS)
+            if both := sorted(train & valid):
+                oddities.append(
+                    f"{len(both)} episodes are in train and in valid, such as {both[0]}"
+                )
+    return oddities
+
+
+def _find_contradictions(path: str | Path, file: h5py.File, names: list[str]) -> Iterator[str]:
+    """Attributes that say another number of steps than the arrays; the arrays are believed."""
+    total, wrong = 0, []
+    try:
+        for name in names:
+            node = read_node(path, file, f"data/{name}/actions")
+            if not isinstance(node, h5py.Dataset) or not node.ndim:
+                return
+            total += len(node)
+            said = read_attribute(path, file, f"data/{name}", "num_samples")
+            if said is not None and said != len(node):
+                wrong.append(f"{name} says {said} of {len(node)}")
+        said = read_attribute(path, file, "data", "total")
+    except DataError:  # told by whoever reads the episodes
+        return
+    if wrong:
+        yield (
+            f"attribute num_samples contradicts the arrays in {len(wrong)} episodes, such as "
+            f"{wrong[0]} steps; the arrays are believed"
+        )
+    if said is not None and said != total:
+        yield f"attribute total says {said} steps, the arrays have {total}, and are believed"

@@ -1,0 +1,294 @@
+"""Any of the formats, opened: what is in it, by which rules it is read, what is wrong with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_bmrl.data import d4rl, lerobot_reader, minari, robomimic, robosuite
+from torchrl_bmrl.data.account import Account
+from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
+from torchrl_bmrl.data.hdf5 import open_file, read_names
+from torchrl_bmrl.data.options import Bounds, ReadOptions
+from torchrl_bmrl.data.raw import RawEpisode, complete
+from torchrl_bmrl.errors import ConfigError, DataError
+
+FORMATS = ("robomimic", "robosuite", "minari", "d4rl", "lerobot")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """A data set that is open for reading.
+
+    Attributes:
+        path: of the file or folder.
+        format: one of :data:`FORMATS`.
+        episodes: by name, each read when it is asked for.
+        options: by which they are read.
+        prefix: of the names inside the file, for messages.
+        bounds: of floating-point actions: those of the options, else those that the data set
+            states, else [-1, 1].
+        metadata: attributes of the file, ``env_args`` and ``masks`` among them, and
+            ``action_bounds`` where they are not [-1, 1].
+        account: knows the episodes that are left out; whoever reads the others adds them.
+        problems: what is wrong beside the episodes: key and message.
+        oddities: what deserves a look beside them.
+    """
+
+    path: Path
+    format: str
+    episodes: Mapping[str, Episode]
+    options: ReadOptions = field(default_factory=ReadOptions)
+    prefix: str = ""
+    bounds: Bounds = (-1.0, 1.0)
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    account: Account = field(default_factory=Account)
+    problems: Sequence[tuple[str, str]] = ()
+    oddities: Sequence[str] = ()
+
+    @property
+    def fps(self) -> float | None:
+        """Steps per second [Hz], where the data set tells them."""
+        kwargs = self.metadata.get("env_args", {}).get("env_kwargs") or {}
+        for known in (self.metadata.get("fps"), kwargs.get("control_freq")):
+            if isinstance(known, int | float) and 0 < known < float("inf"):
+                return float(known)
+        return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Opened:
+    """What a format's reader knows of a data set."""
+
+    episodes: Mapping[str, RawEpisode]
+    metadata: dict[str, Any]
+    prefix: str = ""
+    problems: Sequence[tuple[str, str]] = ()
+    oddities: Sequence[str] = ()
+
+
+def find_format(path: Path) -> str:
+    """Format of a data set: one of :data:`FORMATS`.
+
+    Raises:
+        DataError: if it is none of them.
+    """
+    if path.is_dir():
+        if (path / "data" / "main_data.hdf5").exists():
+            return "minari"
+        if (path / "meta" / "info.json").exists():
+            return "lerobot"
+        valid = "valid: Minari's, LeRobot's, a file"
+        message = "a folder without data/main_data.hdf5 or meta/info.json"
+        raise DataError(path, None, f"{message}; {valid}")
+    with open_file(path) as file:
+        if d4rl.is_d4rl(path, file):
+            return "d4rl"
+        for name in read_names(path, file, "data"):
+            try:
+                present = read_names(path, file, f"data/{name}")
+            except DataError:  # whoever reads it says what is wrong
+                continue
+            if "obs" in present:
+                return "robomimic"
+            if "states" in present:
+                return "robosuite"
+    raise DataError(path, "data", "no demonstration with obs (robomimic) or states (robosuite)")
+
+
+@contextmanager
+def open_source(
+    path: str | Path,
+    *,
+    task: str | None = None,
+    tracking: float = 1.0,
+    to_train: bool = False,
+    **options: Any,
+) -> Iterator[Source]:
+    """Opens a data set of any format.
+
+    Args:
+        path: an HDF5 file, or the folder of a Minari or LeRobot data set.
+        task: whose scene a robosuite ``demo.hdf5`` was recorded in: it holds states alone.
+        tracking: see :func:`torchrl_bmrl.data.robosuite.open_episodes`.
+        to_train: reads only what trains: of a file in robomimic's layout neither the episodes'
+            attributes nor, ``successes`` apart, their extras.
+        options: see :class:`~torchrl_bmrl.data.options.ReadOptions`.
+
+    Raises:
+        DataError: for a missing or damaged data set.
+        ConfigError: for a robosuite file without ``task``, and for options that are invalid or that
+            another format has no use for.
+    """
+    path = Path(path).expanduser()
+    chosen = ReadOptions(**options)
+    form = find_format(path)
+    if form != "robosuite" and (task is not None or tracking != 1.0):
+        raise ConfigError(f"task and tracking are for robosuite's demo.hdf5; {path} is {form}'s")
+    if chosen.split is not None and form != "robomimic":
+        raise ConfigError(f"split is {chosen.split!r}, but {path} is {form}'s, which has no masks")
+    with ExitStack() as stack:
+        if form == "robomimic":
+            opened = _open_robomimic(stack, path, chosen, to_train)
+        elif form == "robosuite":
+            opened = _open_robosuite(stack, path, task, tracking)
+        else:
+            opened = _open_other(stack, path, form)
+        yield _apply(path, form, opened, chosen)
+
+
+def _apply(path: Path, form: str, opened: _Opened, options: ReadOptions) -> Source:
+    """Applies the options to what a format's reader has opened."""
+    account = Account()
+    names = _choose(path, opened, options, account)
+    metadata = dict(opened.metadata)
+    stated = metadata.pop("action_bounds", None)
+    bounds: Bounds = (-1.0, 1.0)
+    if options.bounds == "data":
+        bounds = _range_of_actions(opened.episodes, names)
+    elif options.bounds is not None:
+        bounds = options.bounds
+    elif stated is not None:
+        bounds = stated["low"], stated["high"]
+    if bounds != (-1.0, 1.0):
+        metadata["action_bounds"] = {"low": bounds[0], "high": bounds[1]}
+
+    def read(name: str) -> Episode:
+        return complete(path, f"{opened.prefix}{name}", opened.episodes[name], options)
+
+    return Source(
+        path=path,
+        format=form,
+        episodes=LazyEpisodes(names, read),
+        options=options,
+        prefix=opened.prefix,
+        bounds=bounds,
+        metadata=metadata,
+        account=account,
+        problems=opened.problems,
+        oddities=opened.oddities,
+    )
+
+
+def _choose(path: Path, opened: _Opened, options: ReadOptions, account: Account) -> list[str]:
+    """Names of the episodes to read: all, or those that succeeded."""
+    if not options.successful:
+        return list(opened.episodes)
+    names = []
+    for name in opened.episodes:
+        try:
+            raw = opened.episodes[name]
+        except DataError:  # found again, and reported, when it is read
+            names.append(name)
+            continue
+        if raw.succeeded is None:
+            message = "neither an attribute success nor successes; valid: successful=False"
+            raise DataError(path, f"{opened.prefix}{name}", message)
+        if raw.succeeded:
+            names.append(name)
+        else:
+            account.add_failure(raw)
+    if not names:
+        raise DataError(path, None, f"no episode succeeded of {len(opened.episodes)}")
+    return names
+
+
+def _range_of_actions(episodes: Mapping[str, RawEpisode], names: list[str]) -> Bounds:
+    """Smallest and largest action in each dimension, ±1 around one that is constant."""
+    low, high = np.array(np.inf), np.array(-np.inf)
+    for name in names:
+        try:
+            actions = np.asarray(episodes[name].actions, dtype=np.float64)
+            low = np.minimum(low, actions.min(axis=0))
+            high = np.maximum(high, actions.max(axis=0))
+        except (DataError, ValueError):  # found again, and reported, when it is read
+            continue
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        return -1.0, 1.0
+    constant = low == high
+    low, high = low - constant, high + constant
+    return tuple(np.atleast_1d(low).tolist()), tuple(np.atleast_1d(high).tolist())
+
+
+def _open_robomimic(stack: ExitStack, path: Path, options: ReadOptions, to_train: bool) -> _Opened:
+    episodes = robomimic.open_raw(
+        path, options, extras=["successes"] if to_train else None, attributes=not to_train
+    )
+    return _Opened(
+        episodes=stack.enter_context(episodes),
+        metadata=robomimic.read_metadata(path),
+        prefix="data/",
+        problems=robomimic.find_mask_problems(path),
+        oddities=robomimic.find_oddities(path),
+    )
+
+
+def _open_other(stack: ExitStack, path: Path, form: str) -> _Opened:
+    reader: Any = {"minari": minari, "d4rl": d4rl, "lerobot": lerobot_reader}[form]
+    episodes = stack.enter_context(reader.open_raw(path))
+    told = reader.read_metadata(path)
+    # As gymnasium's environments are in robomimic's layout.
+    env_args = {"env_name": told.get("dataset_id", path.stem), "type": 2, "env_kwargs": {}}
+    kept = ("fps", "action_bounds", "task")
+    return _Opened(
+        episodes=episodes,
+        metadata={"env_args": env_args} | {key: told[key] for key in kept if key in told},
+        oddities=reader.find_oddities(path),
+    )
+
+
+def _open_robosuite(stack: ExitStack, path: Path, task: str | None, tracking: float) -> _Opened:
+    if task is None:
+        raise ConfigError(
+            f"{path} holds simulator states alone; valid: --task, the task whose scene it is"
+        )
+    from torchrl_bmrl.envs.tasks import robosuite_metadata
+
+    episodes = stack.enter_context(robosuite.open_episodes(path, task=task, tracking=tracking))
+
+    def read(name: str) -> RawEpisode:
+        episode = episodes[name]
+        kept = {key: value for key, value in vars(episode).items() if key != "left_out"}
+        return RawEpisode(**kept)
+
+    return _Opened(
+        episodes=LazyEpisodes(episodes, read),
+        metadata={"env_args": robosuite_metadata(task), "task": task},
+        prefix="data/",
+    )
+
+
+def joined(sources: Sequence[Source]) -> Mapping[str, Any]:
+    """Metadata of several sources together: what they agree in, and masks by name.
+
+    Raises:
+        ConfigError: for bounds of actions that differ.
+    """
+    first = sources[0]
+    if wrong := [source for source in sources if source.bounds != first.bounds]:
+        raise ConfigError(
+            f"actions of {wrong[0].path} are bounded by {wrong[0].bounds}, those of {first.path} "
+            f"by {first.bounds}; valid: equal bounds, such as bounds= for all"
+        )
+    metadata = {
+        key: value
+        for key, value in first.metadata.items()
+        if all(source.metadata.get(key) == value for source in sources)
+    }
+    metadata.setdefault("env_args", first.metadata.get("env_args", {}))
+    start = 0
+    masks: dict[str, list[int]] = {}
+    for source in sources:
+        positions = {name: start + i for i, name in enumerate(source.episodes)}
+        start += len(positions)
+        for mask, chosen in source.metadata.get("masks", {}).items():
+            # Of some of the episodes a mask keeps what is left of its own.
+            masks.setdefault(mask, []).extend(
+                positions[name] for name in chosen if name in positions
+            )
+    return metadata | {"masks": masks}
