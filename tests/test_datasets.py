@@ -6,10 +6,12 @@ import errno
 import json
 import multiprocessing
 import os
+import pickle
 import resource
 import shutil
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,10 +32,10 @@ from episode_files import (
     make_episode,
     write_file,
 )
-from tensordict import MemoryMappedTensor, TensorDict
+from tensordict import TensorDict
 from torchrl.data import SliceSampler
 from torchrl.data.datasets import load_dataset
-from torchrl.envs.transforms import CatTensors, Compose
+from torchrl.envs.transforms import CatTensors, Compose, Transform
 
 from torchrl_bmrl.data import datasets
 from torchrl_bmrl.data.datasets import RobomimicExperienceReplay
@@ -45,7 +47,10 @@ from torchrl_bmrl.data.demonstrations import (
     write_statistics,
 )
 from torchrl_bmrl.data.episodes import Episode
+from torchrl_bmrl.data.n_step import NStep
+from torchrl_bmrl.data.replay import make_mixed_replay_buffer, make_replay_buffer, with_previous
 from torchrl_bmrl.data.robomimic import write_episodes
+from torchrl_bmrl.data.sampler import read_memmap
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
 
 TOTAL = sum(LENGTHS)
@@ -202,12 +207,18 @@ def test_attributes_that_json_does_not_know_are_kept_as_text(path: Path) -> None
     assert RobomimicExperienceReplay(path).metadata["complex"] == "1j"
 
 
-def test_the_data_are_memory_mapped(path: Path) -> None:
+def maps_of(folder: Path) -> dict[str, str]:
+    """How this process maps the files of a folder: flags by name."""
+    lines = [line.split(maxsplit=5) for line in Path("/proc/self/maps").read_text().splitlines()]
+    mapped = {words[5]: words[1] for words in lines if len(words) == 6}
+    return {name: flags for name, flags in mapped.items() if Path(name).is_relative_to(folder)}
+
+
+def test_the_data_are_memory_mapped_and_privately(path: Path) -> None:
     for options in ({}, {"split_trajs": True}):
         replay = RobomimicExperienceReplay(path, **options)
-        for leaf in replay._storage._storage.values(include_nested=True, leaves_only=True):
-            assert isinstance(leaf, MemoryMappedTensor)
-            assert Path(leaf.filename).is_relative_to(replay.data_path)
+        files = {str(file) for file in replay.data_path.rglob("*.memmap")}
+        assert maps_of(replay.data_path) == dict.fromkeys(files, "rw-p")
 
 
 def test_the_registered_prefix_loads_a_file(path: Path, tmp_path: Path) -> None:
@@ -276,30 +287,242 @@ def test_a_pickle_among_the_converted_data_is_refused_and_not_executed(
     data.memmap(tmp_path / "changed")
     shutil.copytree(tmp_path / "changed", folder / "data", dirs_exist_ok=True)
     metadata = json.loads((folder / "metadata.json").read_text())
-    metadata["sizes"] = {name: (folder / name).stat().st_size for name in metadata["sizes"]}
+    metadata["crc32"] = {name: datasets._crc32(folder / name) for name in metadata["crc32"]}
     (folder / "metadata.json").write_text(json.dumps(metadata))
+    (folder / "metadata.crc32").write_text(datasets._crc32(folder / "metadata.json"))
     with pytest.raises(DataError, match="pickle"):
-        RobomimicExperienceReplay(path)
+        read_memmap(folder / "data")
+    shutil.copytree(folder, tmp_path / "kept")
+    assert "x" not in set(RobomimicExperienceReplay(path)[:].keys())
     assert not executed.exists()
+    folder = tmp_path / "kept"
     with pytest.warns(FutureWarning, match="pickle"):  # it would have been
         TensorDict.load_memmap(folder / "data")
     assert executed.exists()
 
 
-@pytest.mark.parametrize("damage", ["shortened", "removed", "emptied"])
-def test_a_damaged_cache_is_made_anew(path: Path, damage: str) -> None:
+DAMAGES: dict[str, Callable[[Path], Any]] = {
+    "shortened": lambda folder: os.truncate(folder / "data/object.memmap", 16),
+    "removed": lambda folder: (folder / "data/object.memmap").unlink(),
+    "renamed": lambda folder: (folder / "data").rename(folder / "other"),
+    "emptied": lambda folder: (shutil.rmtree(folder), folder.mkdir()),
+    "no checksum": lambda folder: (folder / "metadata.crc32").unlink(),
+    "no metadata": lambda folder: (folder / "metadata.json").unlink(),
+    "other metadata": lambda folder: (
+        (folder / "metadata.json").write_text("[]"),
+        (folder / "metadata.crc32").write_text(datasets._crc32(folder / "metadata.json")),
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_cache_is_made_anew(path: Path, damage: str, converted: list[Path]) -> None:
     replay = RobomimicExperienceReplay(path)
-    before = replay[:].clone()
-    memmap = replay.data_path / "data" / "object.memmap"
-    if damage == "shortened":
-        os.truncate(memmap, 16)
-    elif damage == "removed":
-        memmap.unlink()
+    before, metadata = replay[:].clone(), replay.metadata
+    DAMAGES[damage](replay.data_path)
+    again = RobomimicExperienceReplay(path)
+    assert len(converted) == 2
+    assert (again[:] == before).all()
+    assert again.metadata == metadata
+    assert entries(path.parent) == sorted([path.name, replay.data_path.name])
+
+
+@pytest.mark.parametrize("split_trajs", [False, True])
+def test_a_flipped_bit_in_any_file_leads_to_a_new_conversion(
+    path: Path, split_trajs: bool, converted: list[Path]
+) -> None:
+    replay = RobomimicExperienceReplay(path, split_trajs=split_trajs)
+    before, metadata, folder = replay[:].clone(), replay.metadata, replay.data_path
+    files = [file for file in sorted(folder.rglob("*")) if file.is_file()]
+    assert len(files) == len(metadata["crc32"]) + 2
+    for number, file in enumerate(files, start=1):
+        assert len(converted) == number
+        content = bytearray(file.read_bytes())
+        content[len(content) // 2] ^= 1
+        file.write_bytes(content)
+        again = RobomimicExperienceReplay(path, split_trajs=split_trajs)
+        assert len(converted) == number + 1, file
+        assert (again[:] == before).all()
+        assert again.metadata == metadata
+
+
+def test_a_disk_that_does_not_keep_what_is_written_is_named(
+    path: Path, monkeypatch: pytest.MonkeyPatch, converted: list[Path]
+) -> None:
+    monkeypatch.setattr(datasets, "_crc32", lambda file: os.urandom(4).hex())
+    with pytest.raises(DataError, match=r"lift\.hdf5: its conversion .* cannot be read back as"):
+        RobomimicExperienceReplay(path)
+    assert len(converted) == datasets.ATTEMPTS
+
+
+def test_a_conversion_that_vanishes_while_it_is_read_is_made_anew(
+    path: Path, monkeypatch: pytest.MonkeyPatch, converted: list[Path]
+) -> None:
+    folder = RobomimicExperienceReplay(path).data_path
+    read = datasets.read_memmap
+    memmap = folder / "data" / "object.memmap"
+
+    def remove_first(data: Path) -> TensorDict:
+        memmap.unlink()  # tensordict reads the rest, without a word
+        monkeypatch.setattr(datasets, "read_memmap", read)
+        return read(data)
+
+    monkeypatch.setattr(datasets, "read_memmap", remove_first)
+    assert "object" in set(RobomimicExperienceReplay(path)[:].keys())
+    assert len(converted) == 2
+
+
+# -- nothing reaches the files ---------------------------------------------------------------------
+
+
+class AddOne(Transform):
+    """Adds to what it gets, in place."""
+
+    def __init__(self, *keys: Any) -> None:
+        super().__init__(in_keys=list(keys), out_keys=list(keys))
+
+    def _apply_transform(self, obs: torch.Tensor) -> torch.Tensor:
+        return obs.add_(1)
+
+
+def every_leaf(data: Any) -> None:
+    for leaf in data.values(include_nested=True, leaves_only=True):
+        leaf.zero_()
+
+
+def add_in_a_worker(replay: Any, results: Any) -> None:
+    every_leaf(replay[:])
+    every_leaf(replay.sample(4))
+    results.put(replay[:]["object"].sum().item())
+
+
+def let_a_worker_write(replay: Any) -> None:
+    results = SPAWN.Queue()
+    process = SPAWN.Process(target=add_in_a_worker, args=(replay, results))
+    process.start()
+    assert results.get(timeout=60) == 0
+    process.join(60)
+    assert process.exitcode == 0
+
+
+def let_a_fork_write(replay: Any) -> None:
+    if child := os.fork():
+        assert os.waitpid(child, 0)[1] == 0
     else:
-        shutil.rmtree(replay.data_path)
-        replay.data_path.mkdir()
-    again = RobomimicExperienceReplay(path)[:]
-    assert torch.equal(again["object"], before["object"])
+        every_leaf(replay[:])
+        os._exit(0)
+
+
+def slices(replay: Any) -> Any:
+    sampler = SliceSampler(num_slices=2, traj_key="episode", strict_length=False)
+    again = RobomimicExperienceReplay(replay.dataset_id, batch_size=4, sampler=sampler)
+    return again.sample()
+
+
+def normalise(replay: Any) -> None:
+    transform = AddOne("object", ("next", "reward"))
+    again = RobomimicExperienceReplay(replay.dataset_id, batch_size=4, transform=transform)
+    again.sample()
+    again[:]
+    next(iter(again))
+
+
+def write_over(data: Any) -> None:
+    with pytest.raises(RuntimeError):  # there is no file that it knew of
+        data.memmap_refresh_()
+    data.update_(data.clone().zero_())
+    data.copy_(data.clone().zero_())
+    data.apply_(lambda leaf: leaf.zero_())
+    data[:2] = data[2:4].clone().zero_()
+    data["object"].numpy()[:] = 0
+    data["object"].untyped_storage().fill_(0)
+
+
+WRITES: dict[str, Callable[[Any], Any]] = {
+    "one entry": lambda replay: replay[:]["next", "reward"].sub_(1),
+    "every entry": lambda replay: every_leaf(replay[:]),
+    "rows": lambda replay: every_leaf(replay[2:5]),
+    "one row": lambda replay: every_leaf(replay[3]),
+    "a sample": lambda replay: every_leaf(replay.sample(4)),
+    "slices": lambda replay: every_leaf(slices(replay)),
+    "transforms": normalise,
+    "tensordict's own": lambda replay: write_over(replay[:]),
+    "the storage": lambda replay: every_leaf(replay.storage[:]),
+    "shared": lambda replay: every_leaf(replay[:].share_memory_()),
+    "to the CPU": lambda replay: every_leaf(replay[:].to("cpu").contiguous()),
+    "memory-mapped again": lambda replay: every_leaf(replay[:].memmap_()),
+    "pickled": lambda replay: every_leaf(pickle.loads(pickle.dumps(replay[:]))),
+    "pickled buffer": lambda replay: every_leaf(pickle.loads(pickle.dumps(replay))[:]),
+    "copied buffer": lambda replay: every_leaf(deepcopy(replay)[:]),
+    "previous": lambda replay: every_leaf(with_previous(replay[:], ["object"])),
+    "single buffer": lambda replay: every_leaf(make_replay_buffer(replay[:], batch_size=4)[:]),
+    "mixed buffer": lambda replay: every_leaf(
+        make_mixed_replay_buffer([replay[:], replay[:]], weights=[1, 1], batch_size=4)[:]
+    ),
+    "n-step": lambda replay: every_leaf(NStep(2, 0.9)(replay[:])),
+    "another process": let_a_worker_write,
+    "a fork": let_a_fork_write,
+    "dumped and loaded": lambda replay: (
+        every_leaf(replay[:]),
+        replay.dumps(replay.data_path.parent / "dump"),
+        replay.loads(replay.data_path.parent / "dump"),
+    ),
+    "its state": lambda replay: (
+        every_leaf(replay[:]),
+        replay.load_state_dict(replay.state_dict()),
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("write", "split_trajs"),
+    [*((write, False) for write in WRITES), ("every entry", True), ("tensordict's own", True)],
+)
+def test_nothing_that_is_done_to_the_data_reaches_the_files(
+    path: Path, write: str, split_trajs: bool, converted: list[Path]
+) -> None:
+    replay = RobomimicExperienceReplay(path, split_trajs=split_trajs)
+    files = {file: file.read_bytes() for file in replay.data_path.rglob("*") if file.is_file()}
+    before = replay[:].clone()
+    WRITES[write](replay)
+    assert {file: file.read_bytes() for file in files} == files
+    again = RobomimicExperienceReplay(path, split_trajs=split_trajs)
+    assert (again[:] == before).all()
+    assert len(converted) == 1
+
+
+def test_what_a_process_changed_is_what_it_and_its_copies_see(path: Path) -> None:
+    replay = RobomimicExperienceReplay(path)
+    replay[:]["next", "reward"].fill_(7)
+    for data in (replay[:], replay.sample(4), pickle.loads(pickle.dumps(replay))[:]):
+        assert (data["next", "reward"] == 7).all()
+
+
+def test_a_folder_that_cannot_be_written_is_read(path: Path, converted: list[Path]) -> None:
+    folder = RobomimicExperienceReplay(path).data_path
+    for file in [*folder.rglob("*"), folder]:
+        file.chmod(0o555 if file.is_dir() else 0o444)
+    try:
+        every_leaf(RobomimicExperienceReplay(path)[:])
+    finally:
+        for file in [folder, *folder.rglob("*")]:
+            file.chmod(0o755 if file.is_dir() else 0o644)
+    assert len(converted) == 1
+
+
+@pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="Linux counts what may be written")
+def test_data_larger_than_memory_can_be_mapped(tmp_path: Path) -> None:
+    """Sparse files: there is nothing to read."""
+    size = 2 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    TensorDict({"x": torch.zeros(8, dtype=torch.uint8)}, [8]).memmap(tmp_path / "data")
+    os.truncate(tmp_path / "data" / "x.memmap", size)
+    meta = json.loads((tmp_path / "data" / "meta.json").read_text())
+    meta["x"]["shape"] = meta["shape"] = [size]
+    (tmp_path / "data" / "meta.json").write_text(json.dumps(meta))
+    data = read_memmap(tmp_path / "data")
+    data["x"][-1] = 3
+    assert (len(data), int(data["x"][-1])) == (size, 3)
+    assert int(read_memmap(tmp_path / "data")["x"][-1]) == 0
 
 
 def test_a_relative_path_outlives_the_working_directory(

@@ -185,9 +185,7 @@ def test_a_file_of_each_layout_goes_to_each_format_and_back_or_the_loss_is_named
         np.testing.assert_array_equal(data["next", "x"][rows][:-1], x[1:-1])
         known = layout in KNOWS_THE_LAST and to != "lerobot"
         np.testing.assert_array_equal(data["next", "x"][rows][-1], x[-1] if known else x[-2])
-    np.testing.assert_array_equal(
-        data["next", "reward"].squeeze(-1), np.tile(1.0 * LAST, EPISODES)
-    )
+    np.testing.assert_array_equal(data["next", "reward"].squeeze(-1), np.tile(1.0 * LAST, EPISODES))
     ends = np.tile(LAST, EPISODES)
     terminates = options.get("dones_terminate", False)
     np.testing.assert_array_equal(data["next", "terminated"].squeeze(-1), ends & terminates)

@@ -6,7 +6,9 @@ import hashlib
 import json
 import os
 import shutil
+import uuid
 import warnings
+import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -31,8 +33,10 @@ from torchrl_bmrl.data.sources import Source, find_format, open_source
 from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.files import new_folder
 
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 2
 """Part of a cache's name: another version converts anew."""
+ATTEMPTS = 3
+"""Conversions before a file system that gives back other data than were written is reported."""
 
 
 class FixedStorage(TensorStorage):
@@ -156,14 +160,19 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
             # In one order, so that one folder serves them all.
             options["observation_keys"] = sorted(chosen.observation_keys)
         self._path = self.root / f"{source.stem}-{_digest(source, options, split_trajs)}"
-        if not self._is_downloaded():
-            if self._path.exists() and not self._is_downloaded():
-                # Damaged. (Asked twice: another process may just have finished.)
-                shutil.rmtree(self._path, ignore_errors=True)
+        read = _read(self._path)
+        for _ in range(ATTEMPTS):
+            if read is not None:
+                break
+            _set_aside(self._path)
             _convert(source, self._path, options, split_trajs)
+            read = _read(self._path)
+        if read is None:
+            message = "cannot be read back as it was written, or replaced; valid: root=, a folder"
+            raise DataError(source, None, f"its conversion {self._path} {message} on a sound disk")
+        data, self._metadata = read
         for text in self.metadata["warnings"]:
             warnings.warn(f"{source}: {text}", stacklevel=2)
-        data = read_memmap(self._path / "data")
         super().__init__(
             storage=FixedStorage(data),
             sampler=sampler,
@@ -186,11 +195,7 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
         return self._path
 
     def _is_downloaded(self) -> bool:
-        try:
-            sizes = self.metadata["sizes"]
-            return all((self._path / name).stat().st_size == size for name, size in sizes.items())
-        except (OSError, ValueError, KeyError):
-            return False
+        return _read_metadata(self._path) is not None
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -201,7 +206,54 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
         of every part of the observation that is a vector of floating-point numbers, ready for
         ``ObservationNorm``.
         """
-        return json.loads((self._path / "metadata.json").read_text())
+        return json.loads(self._metadata)
+
+
+def _read(path: Path) -> tuple[TensorDict, str] | None:
+    """Data and metadata of a conversion; ``None`` if there is none, or not as it was written."""
+    metadata = _read_metadata(path)
+    if metadata is None:
+        return None
+    try:
+        data = read_memmap(path / "data")
+    except DataError:
+        return None
+    # Another process may have removed it meanwhile: what is not there, tensordict leaves out.
+    leaves = len(list(data.keys(include_nested=True, leaves_only=True)))
+    files = sum(name.endswith(".memmap") for name in json.loads(metadata)["crc32"])
+    return (data, metadata) if leaves == files else None
+
+
+def _read_metadata(path: Path) -> str | None:
+    """The metadata of a conversion whose every file is as it was written."""
+    try:
+        text = (path / "metadata.json").read_bytes()
+        if (path / "metadata.crc32").read_text() != f"{zlib.crc32(text):08x}":
+            return None
+        whole = all(_crc32(path / name) == crc for name, crc in json.loads(text)["crc32"].items())
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return text.decode() if whole else None
+
+
+def _crc32(file: Path) -> str:
+    """Checksum of a file: it finds every flipped byte, at several times the speed of a SHA-256."""
+    crc, block = 0, bytearray(1 << 20)
+    with file.open("rb", buffering=0) as stream:
+        while size := stream.readinto(block):
+            crc = zlib.crc32(memoryview(block)[:size], crc)
+    return f"{crc:08x}"
+
+
+def _set_aside(path: Path) -> None:
+    """Removes a damaged conversion, if there is one."""
+    # Renamed first: other processes find a whole folder under the name, or none.
+    aside = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
+    try:
+        path.rename(aside)
+    except OSError:  # none, or a folder that cannot be written: converting will say so
+        return
+    shutil.rmtree(aside, ignore_errors=True)
 
 
 def _digest(source: Path, options: Mapping[str, Any], split_trajs: bool) -> str:
@@ -237,13 +289,14 @@ def _convert(source: Path, target: Path, options: Mapping[str, Any], split_trajs
             metadata["statistics"] = _statistics(data)
             if split_trajs:
                 _split(folder / "data")
-            sizes = {
-                str(file.relative_to(folder)): file.stat().st_size
+            metadata["crc32"] = {
+                str(file.relative_to(folder)): _crc32(file)
                 for file in sorted(folder.rglob("*"))
                 if file.is_file()
             }
-            text = json.dumps(metadata | {"sizes": sizes}, default=str)
-            (folder / "metadata.json").write_text(text)
+            text = json.dumps(metadata, default=str).encode()
+            (folder / "metadata.json").write_bytes(text)
+            (folder / "metadata.crc32").write_text(f"{zlib.crc32(text):08x}")
     except OSError as error:
         raise DataError(
             source,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import mmap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,14 @@ from torchrl_bmrl.errors import BMRLError, DataError
 Device = torch.device | str | None
 
 
+MAP_NORESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # Python knows the name from 3.13 on
+
+
 def read_memmap(path: Path) -> TensorDict:
-    """Memory-mapped tensors, and no objects beside them, which would be pickles.
+    """Tensors in memory-mapped files that no operation on them changes.
+
+    The maps are private: pages that a process writes to become its own. There are no objects among
+    them, which would be pickles.
 
     Args:
         path: their folder.
@@ -32,13 +39,39 @@ def read_memmap(path: Path) -> TensorDict:
         >>> import tempfile
         >>> path = Path(tempfile.mkdtemp()) / "data"
         >>> _ = TensorDict({"action": torch.ones(4, 2)}, [4]).memmap(path)
-        >>> read_memmap(path)["action"].shape
-        torch.Size([4, 2])
+        >>> _ = read_memmap(path)["action"].zero_()
+        >>> read_memmap(path)["action"].sum()
+        tensor(8.)
     """
     try:
-        return TensorDict.load_memmap(path, allow_pickle=False)
+        # Its maps are the files themselves, and it knows their names.
+        return TensorDict.load_memmap(path, allow_pickle=False).apply(_private)
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(path, None, f"no memory-mapped tensors alone ({error})") from error
+
+
+def _private(leaf: Tensor) -> Tensor:
+    """The file of a memory-mapped tensor, mapped again so that writes stay in this process."""
+    name = getattr(leaf, "filename", None)
+    if name is None:  # without elements there is no file
+        return leaf
+    size = leaf.numel() * leaf.element_size()
+    try:
+        content = torch.from_file(str(name), shared=False, size=size, dtype=torch.uint8)
+        # PyTorch takes every map of its own for one that can be shared, and fails to hand such a
+        # tensor to another process. It copies what numpy holds.
+        content = torch.from_numpy(content.numpy())
+    except RuntimeError:
+        # Linux reserves memory for all that might be written, and refuses maps larger than what it
+        # has. This way of mapping reserves none, but keeps a file open for each tensor.
+        if not hasattr(mmap, "MAP_PRIVATE"):
+            raise
+        with open(name, "rb") as file:
+            flags = mmap.MAP_PRIVATE | MAP_NORESERVE
+            protection = mmap.PROT_READ | mmap.PROT_WRITE
+            mapped = mmap.mmap(file.fileno(), size, flags=flags, prot=protection)
+        content = torch.frombuffer(mapped, dtype=torch.uint8)
+    return content.view(leaf.dtype).view(leaf.shape)
 
 
 class TaskSampler(Sampler):
