@@ -12,14 +12,17 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from torchrl_bmrl.command_line import exit_codes
 from torchrl_bmrl.data.convert import TARGETS, Source, convert, open_source
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robosuite import Relabelling
 from torchrl_bmrl.data.schema import Summary, summarise
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.names import TASKS
+
+with needs("data"):
+    from tqdm import tqdm
 
 
 def describe(path: Path, source: Source, summary: Summary) -> Iterator[str]:

@@ -26,7 +26,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
@@ -41,7 +40,11 @@ from torchrl_bmrl.data.hdf5 import (
 )
 from torchrl_bmrl.data.schema import check_episode, layout_of
 from torchrl_bmrl.errors import ConfigError, DataError
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import atomic_path, write_atomic
+
+with needs("data"):
+    import h5py
 
 MASKS = ("train", "valid")
 STEP_KEYS = ("actions", "rewards", "dones", "terminated", "obs", "next_obs")

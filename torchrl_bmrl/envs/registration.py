@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import gymnasium
-
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.names import TASKS, gymnasium_id, horizon_of
+
+with needs("robosuite"):
+    import gymnasium
 
 
 def register() -> None:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_bmrl.errors import BMRLError, RenderError
+from torchrl_bmrl.extras import needs
 
 GOAL_MARKER = "goal_marker"
 """The one site of a scene that is shown; the others are robosuite's own aids."""
@@ -119,7 +120,8 @@ def _run(library: str, arguments: list[str], report: Callable[[int], Any]) -> st
 
 def _render(task: str, result: str) -> None:
     """The process: pictures of all scenes, one line of output for each."""
-    import mujoco
+    with needs("robosuite"):
+        import mujoco
 
     camera = mujoco.MjvCamera()
     camera.lookat[:] = _TARGET

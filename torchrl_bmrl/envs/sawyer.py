@@ -6,17 +6,17 @@ import warnings
 from collections.abc import Mapping
 from typing import Any
 
-import gymnasium
-import mujoco
 import numpy as np
 
-from torchrl_bmrl.envs.caching import user_numba_cache
+from torchrl_bmrl.envs.stepper import FastStepper
 from torchrl_bmrl.envs.tasks import CONTROL_FREQUENCY, REWARD_TERMS, make_robosuite_env
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.names import STEPPERS
 
-with user_numba_cache():
-    from torchrl_bmrl.envs.stepper import FastStepper
+with needs("robosuite"):
+    import gymnasium
+    import mujoco
 
 _PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION
 _said: set[str] = set()

@@ -6,11 +6,14 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 
 from torchrl_bmrl.envs.sawyer import SawyerEnv
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.extras import needs
+
+with needs("robosuite"):
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
 
 
 class SawyerVectorEnv(VectorEnv):
