@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from torchrl_bmrl.errors import MissingExtraError
@@ -35,6 +38,28 @@ def check_mujoco(version: str | None) -> None:
     else:
         return
     raise MissingExtraError("mujoco", "robosuite", reason)
+
+
+@contextmanager
+def kept_environment(variable: str) -> Iterator[None]:
+    """Leaves a variable of the environment as it was.
+
+    robosuite's import sets ``MUJOCO_GL`` to EGL, whatever the machine has and the user chose.
+
+    Example:
+        >>> with kept_environment("NO_SUCH_VARIABLE"):
+        ...     os.environ["NO_SUCH_VARIABLE"] = "egl"
+        >>> "NO_SUCH_VARIABLE" in os.environ
+        False
+    """
+    before = os.environ.get(variable)
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop(variable, None)
+        else:
+            os.environ[variable] = before
 
 
 def mujoco_library(folder: Path, version: str, platform: str) -> Path | str:

@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from torchrl_bmrl.envs.caching import user_numba_cache
-from torchrl_bmrl.envs.physics import check_mujoco
+from torchrl_bmrl.envs.physics import check_mujoco, kept_environment
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.extras import needs
 from torchrl_bmrl.names import PUSH_DIRECTIONS, TASKS, check_task, composition_stages
@@ -26,7 +26,7 @@ from torchrl_bmrl.names import PUSH_DIRECTIONS, TASKS, check_task, composition_s
 # A level set before its import is undone by it; a filter stays.
 logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= logging.ERROR)
 
-with needs("robosuite"), user_numba_cache():
+with needs("robosuite"), user_numba_cache(), kept_environment("MUJOCO_GL"):
     import mujoco
 
     check_mujoco(getattr(mujoco, "__version__", None))

@@ -125,6 +125,20 @@ class SawyerVectorEnv(VectorEnv):
             _stack(infos),
         )
 
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Picture of each episode, as ``SawyerEnv.render`` gives it; ``None`` without a mode.
+
+        Raises:
+            BMRLError: before the first reset.
+        """
+        if self.render_mode is None:
+            return None
+        pictures = []
+        for i in range(self.num_envs):
+            self._env._load_state(self._state(i))
+            pictures.append(self._env._draw())
+        return tuple(pictures)
+
     def get_states(self) -> list[dict[str, np.ndarray]]:
         """State of each episode, as ``SawyerEnv.get_state`` gives it.
 
