@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import os
 
+import needed  # noqa: F401 (first)
+
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 import importlib
@@ -23,7 +25,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import hydra
 import torch
 from algorithms import bc, bcq, ddpg, iql, make_actor, make_critics, plas, td3_bc
@@ -52,11 +53,15 @@ from torchrl_bmrl.checkpoint import load_checkpoint, save_checkpoint
 from torchrl_bmrl.command_line import exit_codes
 from torchrl_bmrl.errors import ConfigError, UnknownNameError
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import finite, read_rows, whole, write_atomic, write_rows
 from torchrl_bmrl.health import check_metrics
 from torchrl_bmrl.locks import hold
 from torchrl_bmrl.parallel import Report, available_cores, derive_seed, run_jobs
 from torchrl_bmrl.runs import open_run
+
+with needs("robosuite"):
+    import gymnasium
 
 
 @dataclass

@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import os
 
+import needed  # noqa: F401 (first)
+
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 import json

@@ -10,8 +10,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-import safetensors
-import safetensors.torch
 import tensordict
 import torch
 import torchrl
@@ -20,8 +18,13 @@ from torch.optim import Adam
 
 from torchrl_bmrl import __version__
 from torchrl_bmrl.errors import CheckpointError
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import link_or_copy, write_atomic
 from torchrl_bmrl.training import get_rng_state, load_adam, set_rng_state
+
+with needs("recipes"):
+    import safetensors
+    import safetensors.torch
 
 _HEADER, _SUM = "checkpoint", "sha256"
 _TENSOR, _PAIRS = "__tensor__", "__pairs__"

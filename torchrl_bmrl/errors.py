@@ -54,6 +54,33 @@ class UnknownNameError(BMRLError):
         return f"unknown {self.kind} {self.value!r}; valid {_plural(self.kind)}: {choices}"
 
 
+class MissingExtraError(BMRLError, ImportError):
+    """A package that is not installed, or not usable, of one of this library's extras.
+
+    Args:
+        package: what cannot be imported.
+        extra: the extra that brings it.
+        reason: why not, where it is there; ``None`` where it is not.
+
+    Example:
+        >>> print(MissingExtraError("h5py", "data"))
+        no h5py; valid: pip install "torchrl_bmrl[data]"
+        >>> print(MissingExtraError("matplotlib", "reports", "libpng.so: no such file"))
+        no usable matplotlib (libpng.so: no such file); valid: pip install "torchrl_bmrl[reports]"
+    """
+
+    def __init__(self, package: str, extra: str, reason: str | None = None) -> None:
+        self.package = package
+        self.extra = extra
+        self.reason = reason
+        super().__init__(package, extra, reason)
+        self.name = package  # ImportError's own
+
+    def __str__(self) -> str:
+        what = f"usable {self.package} ({self.reason})" if self.reason else self.package
+        return f'no {what}; valid: pip install "torchrl_bmrl[{self.extra}]"'
+
+
 class DataError(BMRLError):
     """A dataset file that is missing, damaged or not in the expected layout.
 

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.export import Dim
 
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.generators import candidates
 from torchrl_bmrl.modules import BCQPolicy, DiscreteBCQPolicy, PLASPolicy
@@ -62,8 +63,9 @@ def export_policy(
 
     Raises:
         BMRLError: for one of ``loc`` and ``scale`` without the other, an ``observation_key`` that
-            the policy does not read, an example without what it reads, a generator whose actions
-            are no function of a latent, or without the packages that write ONNX.
+            the policy does not read, an example without what it reads, or a generator whose actions
+            are no function of a latent.
+        MissingExtraError: without the packages that write ONNX.
 
     Example:
         >>> import tempfile
@@ -74,12 +76,9 @@ def export_policy(
         >>> path.stat().st_size > 500_000
         True
     """
-    for package in ("onnx", "onnxscript"):
-        try:
+    with needs("export"):
+        for package in ("onnx", "onnxscript"):
             import_module(package)
-        except ImportError as error:
-            message = f'no {package} ({error}); valid: pip install "torchrl_bmrl[export]"'
-            raise BMRLError(message) from error
     acting = _Acting(policy, loc, scale, observation_key)
     inputs = acting.example(example)
     batch, number = Dim("batch"), Dim("candidates", min=2)

@@ -9,10 +9,12 @@ import socket
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
 from torchrl_bmrl.errors import FolderInUseError
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import write_atomic
+
+with needs("recipes"):
+    from filelock import FileLock, Timeout
 
 
 @contextlib.contextmanager

@@ -19,10 +19,13 @@ from multiprocessing.pool import RemoteTraceback  # type: ignore[attr-defined]
 from typing import Any, TypeVar
 
 import torch
-from tqdm import tqdm
 
 from torchrl_bmrl.errors import BMRLError, StoppedError
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.stops import check_stop, note_signal
+
+with needs("recipes"):
+    from tqdm import tqdm
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

@@ -15,11 +15,14 @@ from typing import Any
 from weakref import WeakSet
 
 import torch
-import yaml
 
 from torchrl_bmrl import __version__
 from torchrl_bmrl.errors import ConfigError, DataError, UnknownNameError
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import link_or_copy, read_json, write_atomic
+
+with needs("recipes"):
+    import yaml
 
 FREE_TO_CHANGE = (
     "run_dir",
@@ -273,7 +276,8 @@ def make_logger(kind: str, run_dir: Path, name: str, step: int = 0) -> Any:
 
 
 def _wandb_options(run_dir: Path) -> dict[str, Any]:
-    import wandb
+    with needs("recipes"):
+        import wandb
 
     mode = os.environ.get("WANDB_MODE") or ("online" if wandb.api.api_key else "offline")
     return {"mode": mode, "project": "torchrl_bmrl", "dir": str(run_dir)}

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from tqdm import tqdm
 
 from torchrl_bmrl.command_line import exit_codes
 from torchrl_bmrl.data.convert import TARGETS, convert
@@ -23,7 +22,11 @@ from torchrl_bmrl.data.options import LastStep, ReadOptions, Reward
 from torchrl_bmrl.data.robosuite import Relabelling
 from torchrl_bmrl.data.schema import Summary, summarise
 from torchrl_bmrl.data.sources import Source, open_source
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.names import TASKS
+
+with needs("data"):
+    from tqdm import tqdm
 
 
 def describe(source: Source, summary: Summary) -> Iterator[str]:

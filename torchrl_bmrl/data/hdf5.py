@@ -8,10 +8,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.extras import needs
+
+with needs("data"):
+    import h5py
 
 DAMAGE = (OSError, RuntimeError, KeyError, TypeError, ValueError, MemoryError)
 """What h5py raises on a damaged file, depending on where the damage is."""

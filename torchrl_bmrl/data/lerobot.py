@@ -24,7 +24,8 @@ import numpy as np
 
 from torchrl_bmrl.data.episodes import Episode, join_observations
 from torchrl_bmrl.data.schema import check_episode, check_fps, layout_of
-from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
+from torchrl_bmrl.errors import ConfigError, DataError
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import new_folder
 
 FILE_SIZE = 100
@@ -60,12 +61,13 @@ def write_episodes(
         DataError: if the folder exists, without episodes, and for an episode that cannot be kept:
             naming episode, key and row. Images are not exported.
         ConfigError: if ``fps`` is not positive or ``task`` is empty.
-        BMRLError: if pyarrow is not installed.
+        MissingExtraError: if pyarrow is not installed.
     """
     check_fps(fps)
     if not task:
         raise ConfigError("task is empty; valid: what the robot does, in words")
-    _require_pyarrow()
+    with needs("data"):  # before anything is written
+        import pyarrow.parquet  # noqa: F401
     path = Path(path)
     with new_folder(path) as folder:
         rows: list[dict[str, Any]] = []
@@ -100,14 +102,6 @@ def write_episodes(
             "features": features,
         }
         _write_json(folder / "meta" / "info.json", info)
-
-
-def _require_pyarrow() -> None:
-    try:
-        import pyarrow.parquet  # noqa: F401
-    except ImportError as error:
-        message = f'no pyarrow ({error}); valid: pip install "torchrl_bmrl[data]"'
-        raise BMRLError(message) from error
 
 
 def _columns(path: Path, name: str, episode: Episode) -> dict[str, np.ndarray]:
@@ -189,7 +183,8 @@ class _Frames:
 
     def write(self, columns: Mapping[str, np.ndarray]) -> tuple[int, int]:
         """Writes an episode; returns the indices of its chunk and file."""
-        from pyarrow.parquet import ParquetWriter
+        with needs("data"):
+            from pyarrow.parquet import ParquetWriter
 
         table = _table(columns)
         if self.writer is None or self.path.stat().st_size >= FILE_SIZE * 2**20:
@@ -204,7 +199,8 @@ class _Frames:
 
 
 def _table(columns: Mapping[str, np.ndarray]) -> Any:
-    import pyarrow as pa
+    with needs("data"):
+        import pyarrow as pa
 
     arrays = {}
     for key, array in columns.items():
@@ -273,8 +269,9 @@ def _total(rows: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
 
 
 def _write_meta(meta: Path, rows: list[dict[str, Any]], task: str) -> None:
-    import pyarrow as pa
-    from pyarrow.parquet import write_table
+    with needs("data"):
+        import pyarrow as pa
+        from pyarrow.parquet import write_table
 
     path = meta / "episodes" / _FILE.format(chunk_index=0, file_index=0)
     path.parent.mkdir(parents=True)

@@ -29,7 +29,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from torchrl_bmrl.data.episodes import Episode, LazyEpisodes, join_observations
@@ -42,8 +41,12 @@ from torchrl_bmrl.data.hdf5 import (
     write_attributes,
 )
 from torchrl_bmrl.data.schema import check_episode, check_fps, layout_of
-from torchrl_bmrl.errors import BMRLError, DataError
+from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import new_folder
+
+with needs("data"):
+    import h5py
 
 _OWN_ATTRIBUTES = ("id", "total_steps")
 _SPACES = ("Box", "Discrete", "MultiBinary", "MultiDiscrete")
@@ -79,18 +82,15 @@ def write_episodes(
         DataError: if the folder exists or its name is no id of Minari's, without episodes, and for
             an episode that cannot be kept: naming episode, key and row.
         ConfigError: if ``fps`` is not positive.
-        BMRLError: if minari is not installed.
+        MissingExtraError: if minari is not installed.
     """
     path = Path(path)
     dataset_id = _dataset_id(path)
     if fps is not None:
         check_fps(fps)
-    try:
+    with needs("data"):
         from minari import __version__ as version
         from minari.dataset.minari_storage import MinariStorage
-    except ImportError as error:
-        message = f'no Minari ({error}); valid: pip install "torchrl_bmrl[data]"'
-        raise BMRLError(message) from error
     with new_folder(path) as folder:
         remaining = iter(episodes)
         first = next(remaining, None)
@@ -167,7 +167,8 @@ def _arrays(path: Path, name: str, episode: Episode) -> dict[str, np.ndarray]:
 
 
 def _spaces(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    from gymnasium.spaces import Dict
+    with needs("data"):
+        from gymnasium.spaces import Dict
 
     prefix = "observations/"
     # Pairs, because gymnasium sorts a mapping, and the parts are to come back in their order.
@@ -177,7 +178,8 @@ def _spaces(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 def _box(array: np.ndarray) -> Any:
     """Contains whatever the dtype can hold."""
-    from gymnasium.spaces import Box
+    with needs("data"):
+        from gymnasium.spaces import Box
 
     dtype, shape = array.dtype, array.shape[1:]
     if dtype.kind == "f":
@@ -353,7 +355,8 @@ def _check_rows(path: Path, key: str, array: np.ndarray, *counts: int) -> np.nda
 
 
 def _read_jpeg(path: Path, file: h5py.File, key: str) -> np.ndarray:
-    from PIL import Image
+    with needs("data"):
+        from PIL import Image
 
     try:
         images = [Image.open(io.BytesIO(row.tobytes())) for row in file[key][()]]

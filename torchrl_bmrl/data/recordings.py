@@ -11,11 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import h5py
 import numpy as np
 
 from torchrl_bmrl.data.hdf5 import read_array, read_attributes
 from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.extras import needs
+
+with needs("data"):
+    import h5py
 
 if TYPE_CHECKING:
     import mujoco
@@ -58,7 +61,8 @@ def read_recording(path: Path, file: h5py.File, name: str) -> Recording:
 
 def _compile(path: Path, key: str, model_file: str) -> mujoco.MjModel:
     """Model of a recording, from XML text or the name of a file in ``models/``."""
-    import mujoco
+    with needs("robosuite"):
+        import mujoco
 
     text: str | bytes = model_file
     label = "the XML text"
@@ -123,7 +127,8 @@ def _check_states(recording: Recording) -> None:
 
 def _quaternion_columns(model: mujoco.MjModel) -> list[int]:
     """Columns of the states where the free joints' quaternions begin."""
-    import mujoco
+    with needs("robosuite"):
+        import mujoco
 
     free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
     return [1 + int(model.jnt_qposadr[joint]) + 3 for joint in free]

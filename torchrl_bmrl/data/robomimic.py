@@ -24,7 +24,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from torchrl_bmrl.data.episodes import Episode
@@ -43,7 +42,11 @@ from torchrl_bmrl.data.robomimic_reader import (
 )
 from torchrl_bmrl.data.schema import check_episode, layout_of
 from torchrl_bmrl.errors import ConfigError, DataError
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import atomic_path, write_atomic
+
+with needs("data"):
+    import h5py
 
 __all__ = [
     "MASKS",

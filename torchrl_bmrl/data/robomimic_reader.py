@@ -14,7 +14,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
@@ -31,6 +30,10 @@ from torchrl_bmrl.data.hdf5 import (
 from torchrl_bmrl.data.options import ReadOptions, check_bounds
 from torchrl_bmrl.data.raw import RawEpisode, complete
 from torchrl_bmrl.errors import ConfigError, DataError
+from torchrl_bmrl.extras import needs
+
+with needs("data"):
+    import h5py
 
 MASKS = ("train", "valid")
 STEP_KEYS = ("actions", "rewards", "dones", "terminated", "obs", "next_obs")

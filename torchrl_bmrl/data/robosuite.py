@@ -27,6 +27,7 @@ from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
 from torchrl_bmrl.data.hdf5 import open_file, read_names
 from torchrl_bmrl.data.recordings import Recording, read_recording, resample
 from torchrl_bmrl.errors import ConfigError, DataError
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.names import check_task
 
 if TYPE_CHECKING:
@@ -179,7 +180,8 @@ class _Scene:
 
 
 def _find_scene(recording: Recording, model: mujoco.MjModel, *, cube: bool) -> _Scene:
-    import mujoco
+    with needs("robosuite"):
+        import mujoco
 
     joints = [model.joint(i).name for i in range(model.njnt)]
     bodies = [model.body(i).name for i in range(model.nbody)]
@@ -284,7 +286,8 @@ def _recorded_path(
     It is the task's end-effector, carried by the recording's hand: files differ in where theirs is
     (11.5 mm further out in 2018) and how it is turned.
     """
-    import mujoco
+    with needs("robosuite"):
+        import mujoco
 
     hand = env.sim.data.body_xmat[here.hand].reshape(3, 3)
     tool = hand.T @ (env.eef_position - env.sim.data.body_xpos[here.hand])
@@ -344,7 +347,8 @@ def _motion(path: np.ndarray, rotations: np.ndarray) -> np.ndarray:
 
     The robot's base, whose axes the controller uses, is not turned against the world.
     """
-    from scipy.spatial.transform import Rotation
+    with needs("robosuite"):
+        from scipy.spatial.transform import Rotation
 
     turns = Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1)).as_rotvec()
     return np.hstack([np.diff(path, axis=0), turns])
@@ -372,7 +376,8 @@ def _gripper_commands(opening: np.ndarray) -> np.ndarray:
 
 def _action_errors(motion: np.ndarray, path: np.ndarray, hands: np.ndarray) -> tuple[float, float]:
     """Largest distance [m] and angle [rad] between what motions (T, 6) add up to and a path."""
-    from scipy.spatial.transform import Rotation
+    with needs("robosuite"):
+        from scipy.spatial.transform import Rotation
 
     reached = path[0] + np.cumsum(motion[:, :3], axis=0)
     rotation, angles = Rotation.from_matrix(hands[0]), []

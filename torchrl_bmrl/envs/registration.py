@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import gymnasium
-
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.names import TASKS, gymnasium_id, horizon_of
+
+with needs("robosuite"):
+    # As a plugin this is called while gymnasium itself is imported.
+    from gymnasium.envs import registration
 
 
 def register() -> None:
@@ -12,12 +15,13 @@ def register() -> None:
 
     Example:
         >>> register()
+        >>> import gymnasium
         >>> gymnasium.spec("bmrl/SawyerReach-v0").kwargs["horizon"]
         200
     """
     for task in (*TASKS, "reach-lift-reach"):
-        if gymnasium_id(task) not in gymnasium.registry:
-            gymnasium.register(
+        if gymnasium_id(task) not in registration.registry:
+            registration.register(
                 gymnasium_id(task),
                 entry_point="torchrl_bmrl.envs.sawyer:SawyerEnv",
                 vector_entry_point="torchrl_bmrl.envs.vector:SawyerVectorEnv",

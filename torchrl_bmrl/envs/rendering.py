@@ -1,7 +1,8 @@
-"""Pictures of stored simulator states, with or without a GPU, or a clear word why there are none.
+"""Pictures of simulator states, with or without a GPU, or a clear word why there are none.
 
 MuJoCo chooses its graphics library once, when it is imported, and a broken one may end the process.
-So the pictures are made in a process of its own, which tries one library after the other.
+So stored states are rendered in a process of its own, which tries one library after the other, and
+an environment uses the library with which such a process made a picture.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ import sys
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
+from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_bmrl.errors import BMRLError, RenderError
+from torchrl_bmrl.extras import needs
 
 GOAL_MARKER = "goal_marker"
 """The one site of a scene that is shown; the others are robosuite's own aids."""
 
+_CONTEXTS = ("egl", "osmesa", "glfw")
+"""Modules of mujoco with a context for each library, as ``MUJOCO_GL`` names them."""
 _TARGET = (-0.1, 0.0, 0.98)  # between table and arm [m]
 _DISTANCE, _AZIMUTH, _ELEVATION = 1.4, 180.0, -20.0  # in front of the table [m, deg, deg]
 
@@ -35,7 +41,8 @@ def render_states(
 ) -> list[NDArray[np.uint8]]:
     """Pictures of simulator states as demonstrations keep them, seen from the front of the table.
 
-    ``MUJOCO_GL`` chooses the graphics library; where it is not set, EGL and OSMesa are tried.
+    ``MUJOCO_GL`` chooses the graphics library; where it is not set, EGL and OSMesa are tried, and
+    GLFW where there is a display.
 
     Args:
         scenes: For each episode its model as MJCF text and its states, shape ``(T, 1 + nq + nv)``:
@@ -58,8 +65,55 @@ def render_states(
     for _, states in scenes:
         if states.ndim != 2 or not np.isfinite(states).all():
             raise BMRLError(f"states must be finite, of shape (T, n), got {states.shape}")
-    if not scenes:
-        return []
+    return _rendered(scenes, size, report)[1] if scenes else []
+
+
+@cache
+def graphics_library() -> str:
+    """Value of ``MUJOCO_GL`` with which pictures can be made here; "" is MuJoCo's own choice.
+
+    It is tried out in a process of its own, once, which takes about a second.
+
+    Raises:
+        RenderError: if no graphics library works here; it says what each one said.
+    """
+    return _rendered([("<mujoco/>", np.zeros((1, 1)))], 8, lambda frames: None)[0]
+
+
+def make_renderer(model: Any, height: int, width: int) -> Any:
+    """A ``mujoco.Renderer`` with :func:`graphics_library`, whatever mujoco chose at its import.
+
+    Args:
+        model: ``mujoco.MjModel``.
+        height: of a picture [pixels].
+        width: likewise.
+
+    Raises:
+        RenderError: if the graphics library does not work in this process.
+    """
+    with needs("robosuite"):
+        import mujoco
+
+    library = graphics_library()
+    size = model.vis.global_
+    size.offheight, size.offwidth = max(size.offheight, height), max(size.offwidth, width)
+    chosen = sys.modules[mujoco.Renderer.__module__].gl_context
+    before = getattr(chosen, "GLContext", None)
+    try:
+        if library in _CONTEXTS:
+            chosen.GLContext = import_module(f"mujoco.{library}").GLContext
+        return mujoco.Renderer(model, height, width)
+    except Exception as error:  # a graphics library raises what it likes
+        reason = str(error).strip().partition("\n")[0] or type(error).__name__
+        raise RenderError([f"{library or 'the default'}: {reason}"]) from error
+    finally:
+        chosen.GLContext = before
+
+
+def _rendered(
+    scenes: Sequence[tuple[str, NDArray[Any]]], size: int, report: Callable[[int], Any]
+) -> tuple[str, list[NDArray[np.uint8]]]:
+    """The first library that works, and each scene's pictures."""
     problems = []
     with tempfile.TemporaryDirectory() as folder:
         task, result = Path(folder, "scenes.npz"), Path(folder, "frames.npz")
@@ -69,7 +123,7 @@ def render_states(
             problem = _run(library, [str(task), str(result)], report)
             if problem is None:
                 with np.load(result) as frames:
-                    return [frames[f"frames{i}"] for i in range(len(scenes))]
+                    return library, [frames[f"frames{i}"] for i in range(len(scenes))]
             problems.append(f"{library or 'the default'}: {problem}")
     raise RenderError(problems)
 
@@ -78,7 +132,10 @@ def _libraries() -> list[str]:
     """Values of ``MUJOCO_GL`` to try; "" is MuJoCo's own choice."""
     if chosen := os.environ.get("MUJOCO_GL"):
         return [chosen]
-    return ["egl", "osmesa"] if sys.platform == "linux" else [""]
+    if sys.platform != "linux":
+        return [""]
+    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    return [*_CONTEXTS[:2], *(_CONTEXTS[2:] if display else ())]
 
 
 def _run(library: str, arguments: list[str], report: Callable[[int], Any]) -> str | None:
@@ -119,7 +176,8 @@ def _run(library: str, arguments: list[str], report: Callable[[int], Any]) -> st
 
 def _render(task: str, result: str) -> None:
     """The process: pictures of all scenes, one line of output for each."""
-    import mujoco
+    with needs("robosuite"):
+        import mujoco
 
     camera = mujoco.MjvCamera()
     camera.lookat[:] = _TARGET

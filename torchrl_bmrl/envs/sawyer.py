@@ -6,17 +6,18 @@ import warnings
 from collections.abc import Mapping
 from typing import Any
 
-import gymnasium
-import mujoco
 import numpy as np
 
-from torchrl_bmrl.envs.caching import user_numba_cache
+from torchrl_bmrl.envs.rendering import graphics_library, make_renderer
+from torchrl_bmrl.envs.stepper import FastStepper
 from torchrl_bmrl.envs.tasks import CONTROL_FREQUENCY, REWARD_TERMS, make_robosuite_env
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.names import STEPPERS
 
-with user_numba_cache():
-    from torchrl_bmrl.envs.stepper import FastStepper
+with needs("robosuite"):
+    import gymnasium
+    import mujoco
 
 _PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION
 _said: set[str] = set()
@@ -44,7 +45,8 @@ class SawyerEnv(gymnasium.Env):
     Args:
         task: one of :data:`torchrl_bmrl.names.TASKS`, or a composition: several joined by ``-``,
             such as ``"reach-lift-reach"``.
-        render_mode: ``None`` or ``"rgb_array"``.
+        render_mode: ``None`` or ``"rgb_array"``, which needs no display
+            (:func:`torchrl_bmrl.envs.rendering.graphics_library`).
         camera: robosuite camera for :meth:`render`.
         image_size: height and width of the rendered picture [pixels].
         stepper: ``"fast"``, compiled code that gives robosuite's trajectories bit by bit, or
@@ -57,6 +59,7 @@ class SawyerEnv(gymnasium.Env):
 
     Raises:
         UnknownNameError: for another task, render mode or stepper.
+        RenderError: for ``render_mode="rgb_array"`` where no graphics library works.
 
     Example:
         >>> env = SawyerEnv("lift")
@@ -86,6 +89,8 @@ class SawyerEnv(gymnasium.Env):
             raise UnknownNameError("render_mode", render_mode, ("rgb_array",))
         if stepper not in STEPPERS:
             raise UnknownNameError("stepper", stepper, STEPPERS)
+        if render_mode is not None:
+            graphics_library()  # not only at the first picture
         self.task = task
         self.render_mode = render_mode
         self.camera = camera
@@ -246,14 +251,19 @@ class SawyerEnv(gymnasium.Env):
     # -- pictures ------------------------------------------------------------------------------
 
     def render(self) -> np.ndarray | None:
-        """Picture of the scene, (height, width, 3) uint8, in mode ``"rgb_array"``."""
-        if self.render_mode is None:
-            return None
+        """Picture of the scene, (height, width, 3) uint8, in mode ``"rgb_array"``.
+
+        Raises:
+            RenderError: if the graphics library does not work in this process.
+        """
+        return None if self.render_mode is None else self._draw()
+
+    def _draw(self) -> np.ndarray:
         env = self.robosuite_env
         if self._picture is None:
             # A model of its own, complete: the one that is simulated has no pictures.
             model = mujoco.MjModel.from_xml_string(env.scene_xml())
-            self._picture = model, mujoco.MjData(model), mujoco.Renderer(model, *self.image_size)
+            self._picture = model, mujoco.MjData(model), make_renderer(model, *self.image_size)
         model, data, renderer = self._picture
         simulated = env.sim.model._model
         model.site_pos[:], model.site_rgba[:] = simulated.site_pos, simulated.site_rgba

@@ -11,34 +11,38 @@ and a contact makes centimetres of it within a second.
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-import mujoco
-import numba
 import numpy as np
-from llvmlite import binding
-from numba import types
-from robosuite.controllers.composite.composite_controller import CompositeController
-from robosuite.controllers.parts.arm.osc import OperationalSpaceController
-from robosuite.controllers.parts.gripper.simple_grip import SimpleGripController
-from robosuite.environments.base import MujocoEnv
-from robosuite.environments.robot_env import RobotEnv
-from robosuite.robots import FixedBaseRobot
-from robosuite.utils.control_utils import nullspace_torques, opspace_matrices, orientation_error
 
+from torchrl_bmrl.envs.caching import cached_njit
+from torchrl_bmrl.envs.physics import mujoco_library
+from torchrl_bmrl.envs.tasks import _BMRLSawyerTask
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.extras import needs
 
-if TYPE_CHECKING:
-    from torchrl_bmrl.envs.tasks import _BMRLSawyerTask
+with needs("robosuite"):
+    import mujoco
+    import numba
+    from llvmlite import binding
+    from numba import types
+    from robosuite.controllers.composite.composite_controller import CompositeController
+    from robosuite.controllers.parts.arm.osc import OperationalSpaceController
+    from robosuite.controllers.parts.gripper.simple_grip import SimpleGripController
+    from robosuite.environments.base import MujocoEnv
+    from robosuite.environments.robot_env import RobotEnv
+    from robosuite.robots import FixedBaseRobot
+    from robosuite.utils.control_utils import (
+        nullspace_torques,
+        opspace_matrices,
+        orientation_error,
+    )
 
-# The library that mujoco's bindings have loaded; compiled code finds its functions by name.
-_libraries = [
-    path
-    for pattern in ("libmujoco.so*", "libmujoco*.dylib", "mujoco.dll")
-    for path in Path(mujoco.__file__).parent.glob(pattern)
-]
-for _library in _libraries:
+# Compiled code finds its functions by name.
+_library = mujoco_library(Path(mujoco.__file__).parent, mujoco.__version__, sys.platform)
+if isinstance(_library, Path):
     binding.load_library_permanently(str(_library))
 _address = types.uintp
 _mj_step1 = types.ExternalFunction("mj_step1", types.void(_address, _address))
@@ -110,13 +114,13 @@ class _Goal(NamedTuple):
     rest: np.ndarray  # (n,) [rad], of the null space
 
 
-@numba.njit(cache=True)
+@cached_njit
 def _numpy_dot(dot: int, arguments: int) -> None:
     # numpy's BLAS is not the one that numba calls, and rounds differently.
     _py_decref(_py_call(dot, arguments, 0))
 
 
-@numba.njit(cache=True)
+@cached_njit
 def _control_period(
     substeps: int, robot: _Robot, scratch: _Scratch, products: _Products, goal: _Goal
 ) -> None:
@@ -177,8 +181,8 @@ def why_not_fast(env: _BMRLSawyerTask) -> str | None:
     Args:
         env: robosuite environment, reset.
     """
-    if not _libraries:
-        return "MuJoCo's library is not beside its Python package"
+    if isinstance(_library, str):
+        return _library
     robot = env.robots[0]
     composite = robot.composite_controller
     arm, gripper = (composite.part_controllers.get(name) for name in ("right", "right_gripper"))

@@ -14,18 +14,22 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
-import mujoco
 import numpy as np
 
 from torchrl_bmrl.envs.caching import user_numba_cache
+from torchrl_bmrl.envs.physics import check_mujoco, kept_environment
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.names import PUSH_DIRECTIONS, TASKS, check_task, composition_stages
 
 # robosuite logs "no private macro file" and controller notes at import and at every construction.
 # A level set before its import is undone by it; a filter stays.
 logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= logging.ERROR)
 
-with user_numba_cache():
+with needs("robosuite"), user_numba_cache(), kept_environment("MUJOCO_GL"):
+    import mujoco
+
+    check_mujoco(getattr(mujoco, "__version__", None))
     import robosuite
     from robosuite.controllers import load_composite_controller_config
     from robosuite.environments.manipulation.manipulation_env import ManipulationEnv

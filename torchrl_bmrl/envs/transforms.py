@@ -23,6 +23,7 @@ from torchrl.envs.transforms import (
 )
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.names import composition_stages, gymnasium_id, horizon_of
 
 OBSERVATION_PARTS = (
@@ -349,7 +350,8 @@ def make_env(
         torch.Size([2, 3, 33])
     """
     # Imported here: the reading of data does not need the simulator.
-    import gymnasium
+    with needs("robosuite"):
+        import gymnasium
 
     from torchrl_bmrl.envs.tasks import REWARD_TERMS
 

@@ -6,11 +6,14 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 
 from torchrl_bmrl.envs.sawyer import SawyerEnv
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.extras import needs
+
+with needs("robosuite"):
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
 
 
 class SawyerVectorEnv(VectorEnv):
@@ -121,6 +124,20 @@ class SawyerVectorEnv(VectorEnv):
             np.array(truncated),
             _stack(infos),
         )
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Picture of each episode, as ``SawyerEnv.render`` gives it; ``None`` without a mode.
+
+        Raises:
+            BMRLError: before the first reset.
+        """
+        if self.render_mode is None:
+            return None
+        pictures = []
+        for i in range(self.num_envs):
+            self._env._load_state(self._state(i))
+            pictures.append(self._env._draw())
+        return tuple(pictures)
 
     def get_states(self) -> list[dict[str, np.ndarray]]:
         """State of each episode, as ``SawyerEnv.get_state`` gives it.

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.evaluation.statistics import Estimate, bootstrap_interval
+from torchrl_bmrl.extras import needs
 
 STAGE_TAIL = 10
 """Steps after success that count as the last stage, half a second.
@@ -149,8 +150,9 @@ def find_stages(
         >>> bool(first != last)
         True
     """
-    from sklearn.mixture import GaussianMixture
-    from threadpoolctl import threadpool_limits
+    with needs("reports"):
+        from sklearn.mixture import GaussianMixture
+        from threadpoolctl import threadpool_limits
 
     training, points = _check_points("training", training), _check_points("points", points)
     if training.shape[1] != points.shape[1]:
@@ -196,7 +198,8 @@ def stage_agreement(
         >>> print(stage_agreement([1, 1, 0, 0], [0, 0, 2, 2], episode=[0, 1, 0, 1]))
         1.00 [1.00, 1.00]
     """
-    from sklearn.metrics import adjusted_mutual_info_score
+    with needs("reports"):
+        from sklearn.metrics import adjusted_mutual_info_score
 
     stage, phase, episode = np.asarray(stage), np.asarray(phase), np.asarray(episode)
     _check_rows(stage.size, stage=stage, phase=phase, episode=episode)
@@ -321,7 +324,8 @@ def _over_episodes(
 def _spearman(first: NDArray[Any], second: NDArray[Any]) -> float:
     if np.ptp(first) == 0.0 or np.ptp(second) == 0.0:
         return 0.0
-    from scipy.stats import spearmanr
+    with needs("reports"):
+        from scipy.stats import spearmanr
 
     return float(spearmanr(first, second).statistic)
 

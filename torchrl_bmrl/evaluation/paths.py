@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.extras import needs
 
 
 class PathError(BMRLError):
@@ -80,8 +81,9 @@ def data_path(
         raise PathError(f"power is {power}; valid: at least 1")
     first, last, between = _points(start, end, data, num_points)
     # Imported here, as scipy.stats is by its neighbours: processes that only roll out do without.
-    from scipy.sparse.csgraph import dijkstra
-    from scipy.spatial.distance import cdist
+    with needs("reports"):
+        from scipy.sparse.csgraph import dijkstra
+        from scipy.spatial.distance import cdist
 
     # Equal points would have hops of cost 0, which csgraph reads as no hop.
     nodes = np.unique(np.vstack([first, last, between]), axis=0)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.extras import needs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,7 +261,8 @@ def rank_correlation(
         >>> print(rank_correlation([0.1, 0.2, 0.3], [10.0, 20.0, 20.0]))
         0.87 [0.00, 1.00]
     """
-    from scipy.stats import rankdata
+    with needs("reports"):
+        from scipy.stats import rankdata
 
     ours, theirs = _vector("x", x), _vector("y", y)
     if len(ours) != len(theirs):
@@ -318,7 +320,8 @@ def _percentiles(
     """scipy's percentile bootstrap of samples that are resampled independently."""
     _check_confidence(confidence)
     # Imported here: scipy.stats takes a second, and processes that only roll out never need it.
-    from scipy.stats import bootstrap
+    with needs("reports"):
+        from scipy.stats import bootstrap
 
     interval = bootstrap(
         samples,

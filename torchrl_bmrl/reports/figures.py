@@ -11,17 +11,20 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Patch
 from numpy.typing import NDArray
 
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports.tables import task_name
+
+with needs("reports"):
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Circle, Patch
 
 # Okabe & Ito's palette, which stays distinct under the common colour-vision deficiencies.
 _OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -174,7 +177,8 @@ def embedding_stages(
         >>> embedding_stages(points, np.arange(20) % 2, np.arange(20) % 2, ["a", "b"])[1:4]
         b'PNG'
     """
-    from scipy.optimize import linear_sum_assignment
+    with needs("reports"):
+        from scipy.optimize import linear_sum_assignment
 
     count = len(phase_names)
     shared = np.array(
@@ -327,8 +331,9 @@ def _tsne(
     task_latent: NDArray[Any], seed: int
 ) -> tuple[NDArray[np.integer[Any]], NDArray[np.float64]]:
     """Which embeddings were drawn at random, at most 3000, and their map ``(N, 2)``."""
-    from sklearn.manifold import TSNE
-    from threadpoolctl import threadpool_limits
+    with needs("reports"):
+        from sklearn.manifold import TSNE
+        from threadpoolctl import threadpool_limits
 
     count = len(task_latent)
     if count < 4:
@@ -355,7 +360,8 @@ def _plane(task_latent: NDArray[Any]) -> tuple[NDArray[np.float64], str]:
         return points, ""
     if dim == 1:
         return np.pad(points, ((0, 0), (0, 1))), "\n1-D, drawn on a line"
-    from sklearn.decomposition import PCA
+    with needs("reports"):
+        from sklearn.decomposition import PCA
 
     plane = PCA(n_components=2, svd_solver="full").fit(points)
     share = plane.explained_variance_ratio_.sum()

@@ -13,6 +13,7 @@ from torchrl_bmrl.data.demonstrations import demonstration_path
 from torchrl_bmrl.data.robomimic import open_episodes
 from torchrl_bmrl.envs.rendering import render_states
 from torchrl_bmrl.errors import DataError, RenderError
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.parallel import Report, run_jobs
 from torchrl_bmrl.reports.explorer import Explorer, Moment
@@ -110,7 +111,8 @@ def _render(scenes: list[tuple[str, NDArray[Any]]]) -> list[NDArray[np.uint8]]:
 
 
 def _webp(picture: NDArray[np.uint8]) -> bytes:
-    from PIL import Image
+    with needs("reports"):
+        from PIL import Image
 
     data = io.BytesIO()
     # Half of what JPEG needs.

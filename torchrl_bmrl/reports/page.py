@@ -7,11 +7,13 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from jinja2 import Environment, StrictUndefined
-
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.reports.explorer import Explorer, style
 from torchrl_bmrl.reports.tables import Table
+
+with needs("reports"):
+    from jinja2 import Environment, StrictUndefined
 
 _TEMPLATE = """\
 <!doctype html>
