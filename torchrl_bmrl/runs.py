@@ -9,7 +9,6 @@ import os
 import platform
 import re
 import subprocess
-import sys
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -22,6 +21,7 @@ import yaml
 from torchrl_bmrl import __version__
 from torchrl_bmrl.errors import ConfigError, DataError, UnknownNameError
 from torchrl_bmrl.files import link_or_copy, read_json, write_atomic
+from torchrl_bmrl.messages import say
 
 FREE_TO_CHANGE = (
     "run_dir",
@@ -266,7 +266,7 @@ def make_logger(kind: str, run_dir: Path, name: str, step: int = 0) -> Any:
             options = {"wandb_kwargs": _wandb_options(run_dir, name)} if kind == "wandb" else {}
             return get_logger(kind, str(folder), name, **options)
         except Exception as error:  # whatever a server or its library may come up with
-            _say(f"{name}: no {kind} ({_first_line(error)}); metrics go to CSV files in {folder}")
+            say(f"{name}: no {kind} ({_first_line(error)}); metrics go to CSV files in {folder}")
     for path in (folder / name / "scalars").glob("*.csv"):
         rows = path.read_text(encoding="utf-8").splitlines(keepends=True)
         kept = [row for row in rows if row.endswith("\n") and _step(row) <= step]
@@ -329,7 +329,7 @@ def log_metrics(logger: Any, metrics: Mapping[str, Any], step: int) -> None:
             logger.log_scalar(name, float(value), step=step)
     except Exception as error:
         _lost.add(logger)
-        _say(f"metrics are logged no more, from step {step} on ({_first_line(error)})")
+        say(f"metrics are logged no more, from step {step} on ({_first_line(error)})")
 
 
 def close_logger(logger: Any) -> None:
@@ -350,7 +350,7 @@ def close_logger(logger: Any) -> None:
     try:
         logger.close()
     except Exception as error:
-        _say(f"the end of the metrics may be missing ({_first_line(error)})")
+        say(f"the end of the metrics may be missing ({_first_line(error)})")
 
 
 _lost: WeakSet[Any] = WeakSet()
@@ -359,7 +359,3 @@ _lost: WeakSet[Any] = WeakSet()
 
 def _first_line(error: Exception) -> str:
     return str(error).strip().partition("\n")[0] or type(error).__name__
-
-
-def _say(message: str) -> None:
-    print(message, file=sys.stderr, flush=True)

@@ -12,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from torchrl_bmrl.command_line import exit_codes
 from torchrl_bmrl.data.convert import TARGETS, Source, convert, open_source
@@ -20,6 +19,7 @@ from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robosuite import Relabelling
 from torchrl_bmrl.data.schema import Summary, summarise
 from torchrl_bmrl.names import TASKS
+from torchrl_bmrl.progress import progress
 
 
 def describe(path: Path, source: Source, summary: Summary) -> Iterator[str]:
@@ -70,7 +70,7 @@ def check(options: argparse.Namespace) -> int:
     """Prints a summary, the warnings and everything that is wrong; 1 if something is."""
     relabelled = []
     with open_source(options.file, task=options.task, tracking=options.tracking) as source:
-        with tqdm(total=len(source.episodes), unit="episode", delay=2, leave=False) as bar:
+        with progress(len(source.episodes), "reading", "episode", delay=2, leave=False) as bar:
 
             def look(name: str, episode: Episode | None) -> None:
                 if source.format == "robosuite" and episode is not None:
@@ -96,7 +96,7 @@ def check(options: argparse.Namespace) -> int:
 
 def convert_command(options: argparse.Namespace) -> int:
     """Converts under a progress bar."""
-    with tqdm(unit="episode", delay=2, leave=False) as bar:
+    with progress(None, "converting", "episode", delay=2, leave=False) as bar:
         convert(
             options.source,
             options.out,
