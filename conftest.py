@@ -58,7 +58,11 @@ _NEEDS = {
     "safetensors": ["torchrl_bmrl/agents.py", "torchrl_bmrl/checkpoint.py"],
     "scipy": ["torchrl_bmrl/evaluation/*", "torchrl_bmrl/reports/*"],
     "sklearn": ["torchrl_bmrl/evaluation/embedding.py", "torchrl_bmrl/reports/figures.py"],
-    "tqdm": ["torchrl_bmrl/data/__main__.py", "torchrl_bmrl/parallel.py"],
+    "tqdm": [
+        "torchrl_bmrl/data/__main__.py",
+        "torchrl_bmrl/parallel.py",
+        "torchrl_bmrl/progress.py",
+    ],
     "yaml": ["torchrl_bmrl/runs.py"],
 }
 collect_ignore_glob = sorted(

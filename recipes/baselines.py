@@ -46,7 +46,7 @@ from torchrl_bmrl.parallel import Report, run_jobs
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
 from torchrl_bmrl.reports.tables import MISSING, Table, policy_name, task_name
-from torchrl_bmrl.runs import log_metrics, make_logger, open_run
+from torchrl_bmrl.runs import close_logger, log_metrics, make_logger, open_run
 from torchrl_bmrl.training import keep_freed_memory
 
 Job = tuple[Config, str, str]
@@ -113,6 +113,8 @@ def train_job(job: Job, report: Report) -> None:
             check(metrics, number)
             learner.save(number)
         raise
+    finally:
+        close_logger(logger)
 
 
 # -- evaluation ------------------------------------------------------------------------------------

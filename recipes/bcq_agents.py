@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ from settings import Config, deciding_settings
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
-from tqdm import tqdm
 
 from torchrl_bmrl.agents import make_bcq_loss
 from torchrl_bmrl.checkpoint import (
@@ -23,6 +21,7 @@ from torchrl_bmrl.checkpoint import (
 from torchrl_bmrl.envs.transforms import ObservationStatistics
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.health import check_metrics, check_proposals, value_limits
+from torchrl_bmrl.messages import say
 from torchrl_bmrl.objectives import BCQLoss, StackedLoss
 from torchrl_bmrl.parallel import derive_seed
 from torchrl_bmrl.training import make_adam
@@ -117,7 +116,7 @@ class Agents:
                 self.diverged[name] = str(error)
                 if not self.well:
                     raise
-                tqdm.write(f"{error}; it is frozen and the others go on", file=sys.stderr)
+                say(f"{error}; it is frozen and the others go on")
                 del rows[name]
         return rows
 

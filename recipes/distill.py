@@ -34,7 +34,7 @@ from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.objectives import BCQLoss
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
-from torchrl_bmrl.runs import log_metrics, make_logger
+from torchrl_bmrl.runs import close_logger, log_metrics, make_logger
 from torchrl_bmrl.training import (
     accelerate,
     gradient_step,
@@ -182,6 +182,8 @@ def train_student(config: Config, report: Report) -> None:
             check(metrics, batch, update)
             save(update)
         raise
+    finally:
+        close_logger(logger)
 
 
 @torch.no_grad()

@@ -49,6 +49,7 @@ from torchrl_bmrl.modules import DemonstrationTaskLatent, StageTaskLatent
 from torchrl_bmrl.modules.task_latent import ALIGNMENTS
 from torchrl_bmrl.names import composition_stages, horizon_of
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
+from torchrl_bmrl.progress import progress
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
 from torchrl_bmrl.reports.tables import Table, task_name
@@ -251,8 +252,10 @@ def imitate(config: Config) -> None:
         )
     load_student(run_dir / "distill" / "checkpoint.safetensors")  # before anything is written
     open_run(run_dir / "imitation", asdict(settings))
-    for number in range(settings.demonstrations):
-        demonstrate(config, number)
+    with progress(settings.demonstrations, "demonstrating", "demonstration") as bar:
+        for number in range(settings.demonstrations):
+            demonstrate(config, number)
+            bar.update(1)
     jobs = [
         (config, method, perturbation, number)
         for method in METHODS

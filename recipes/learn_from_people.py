@@ -39,6 +39,7 @@ from torchrl_bmrl.files import finite, read_rows, whole, write_atomic, write_row
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.names import horizon_of
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
+from torchrl_bmrl.progress import progress
 
 TASK = "lift"
 Job = tuple[Config, float, int]
@@ -133,7 +134,8 @@ def learn_from_people(config: Config) -> None:
     if not human.exists():
         raw = find_format(Path(config.human.path)) == "robosuite"
         options = {"task": TASK, "tracking": config.human.tracking} if raw else {}
-        convert(config.human.path, human, to="robomimic", **options)
+        with progress(None, "converting", "episode") as bar:
+            convert(config.human.path, human, to="robomimic", report=bar.update, **options)
     collect(config)
     agents = [
         (config, share, seed)

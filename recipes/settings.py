@@ -13,7 +13,6 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from tqdm import tqdm
 
 from torchrl_bmrl.agents import LATENT_SOURCES, TASK_ENCODERS
 from torchrl_bmrl.command_line import exit_codes
@@ -21,6 +20,7 @@ from torchrl_bmrl.data.replay import check_device
 from torchrl_bmrl.errors import ConfigError, UnknownNameError
 from torchrl_bmrl.experts.controllers import ExpertGains
 from torchrl_bmrl.locks import hold
+from torchrl_bmrl.messages import say
 from torchrl_bmrl.names import STEPPERS, TASKS, check_task, composition_stages
 from torchrl_bmrl.objectives.bcq import TARGET_DTYPES
 from torchrl_bmrl.objectives.checks import check_value_bounds
@@ -398,7 +398,7 @@ OUT_OF_MEMORY = (
 def tell(config: Config, message: str) -> None:
     """Says what only those want to know who asked for it, with ``verbose``."""
     if config.verbose:
-        tqdm.write(message, file=sys.stderr)
+        say(message)
 
 
 def run_recipe(

@@ -37,7 +37,7 @@ from torchrl_bmrl.evaluation.rollout import evaluate_policy
 from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
-from torchrl_bmrl.runs import log_metrics, make_logger
+from torchrl_bmrl.runs import close_logger, log_metrics, make_logger
 from torchrl_bmrl.training import (
     Update,
     accelerate,
@@ -172,6 +172,9 @@ def train_on(
             kept.healthy(metrics, batch, update)
             kept.save(update)
         raise
+    finally:
+        for logger in loggers.values():
+            close_logger(logger)
 
 
 def evaluate_epoch(config, task, loss, statistics, epoch, update) -> list[dict]:

@@ -25,6 +25,7 @@ from small_runs import Run, contents, times
 from torchrl_bmrl import parallel
 from torchrl_bmrl.checkpoint import load_checkpoint
 from torchrl_bmrl.locks import hold
+from torchrl_bmrl.progress import Lines
 
 pytestmark = [pytest.mark.robosuite, pytest.mark.slow]
 STAGES = ("bcq/*/*", "distill/*", "results.csv", "tables/*", "logs/*/scalars/*")
@@ -63,7 +64,7 @@ def signal_after(patch: pytest.MonkeyPatch, units: int) -> None:
         if sum(done) >= units > sum(done[:-1]):
             signal.raise_signal(signal.SIGTERM)
 
-    patch.setattr(parallel, "tqdm", type("Bar", (parallel.tqdm,), {"update": update}))
+    patch.setattr(parallel, "progress", type("Bar", (Lines,), {"update": update}))
 
 
 @pytest.mark.parametrize(

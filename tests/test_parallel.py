@@ -27,6 +27,7 @@ from torchrl_bmrl.errors import (
     UnknownNameError,
 )
 from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
+from torchrl_bmrl.progress import Lines
 from torchrl_bmrl.stops import stop_on_signals
 
 OPTIONS: dict[str, Any] = {"total": 8, "description": "stage 1: training", "unit": "update"}
@@ -88,8 +89,8 @@ def test_the_job_of_a_killed_worker_is_reported_and_done_again_and_no_other(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     updates: list[int] = []
-    bar = type("Bar", (parallel.tqdm,), {"update": lambda bar, n: updates.append(n)})
-    monkeypatch.setattr(parallel, "tqdm", bar)
+    bar = type("Bar", (Lines,), {"update": lambda bar, n: updates.append(n)})
+    monkeypatch.setattr(parallel, "progress", bar)
     jobs = [(name, tmp_path, deaths) for name, deaths in zip("abcd", (0, 2, 0, 0), strict=True)]
     assert run_jobs(die_until, jobs, workers=2, **OPTIONS) == ["a", "b", "c", "d"]
     assert [len((tmp_path / name).read_text()) for name in "abcd"] == [1, 3, 1, 1]
@@ -228,7 +229,7 @@ def test_a_worker_that_does_not_stop_in_time_is_killed(monkeypatch: pytest.Monke
         if len(reported) == 4:
             signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr(parallel, "tqdm", type("Bar", (parallel.tqdm,), {"update": update}))
+    monkeypatch.setattr(parallel, "progress", type("Bar", (Lines,), {"update": update}))
     with stop_on_signals(), pytest.raises(StoppedError):
         run_jobs(sleep, [1, 2], workers=2, **OPTIONS)
     assert not multiprocessing.active_children()

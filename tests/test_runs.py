@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+import time
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -17,11 +18,13 @@ import torch
 pytest.importorskip("yaml")
 
 import yaml
+from wandb_files import offline, read_runs
 
 from torchrl_bmrl import __version__, runs
 from torchrl_bmrl.errors import ConfigError, DataError, UnknownNameError
 from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.runs import (
+    close_logger,
     log_metrics,
     make_logger,
     open_run,
@@ -319,30 +322,60 @@ def test_tensorboard_writes_events_in_the_run_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_wandb_without_an_account_runs_offline_in_the_run_folder(
+def test_every_wandb_logger_of_a_process_has_a_run_of_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("wandb")
-    for name in ("WANDB_MODE", "WANDB_API_KEY", "NETRC"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    for name in ("WANDB_CACHE_DIR", "WANDB_CONFIG_DIR", "WANDB_DATA_DIR"):
-        monkeypatch.setenv(name, str(tmp_path / "home"))
-    monkeypatch.setenv("WANDB_SILENT", "true")
+    offline(monkeypatch, tmp_path / "home")
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "home").mkdir()
-    logger = make_logger("wandb", tmp_path / "run", "bcq_lift")
-    try:
-        log_metrics(logger, {"loss_qvalue": torch.tensor(0.5)}, 10)
+    names = ["bcq_reach", "bcq_lift", "distill"]
+    loggers = {name: make_logger("wandb", tmp_path / "run", name) for name in names}
+    for step in (10, 20):
+        for number, name in enumerate(names):
+            log_metrics(loggers[name], {"loss": torch.tensor(number + 0.5)}, number + step)
+    for logger in loggers.values():
         settings = logger.experiment.settings
-        assert settings.mode == "offline"
-        assert logger.experiment.project == "torchrl_bmrl"
-        assert logger.experiment.name == "bcq_lift"
-    finally:
-        logger.experiment.finish()
-    runs = list((tmp_path / "run").glob("wandb/offline-run-*/*.wandb"))
-    assert len(runs) == 1
-    assert {path.name for path in tmp_path.iterdir()} <= {"home", "run"}
+        assert (settings.mode, logger.experiment.project) == ("offline", "torchrl_bmrl")
+        close_logger(logger)
+    runs = read_runs(tmp_path / "run")
+    assert [(run["name"], run["ended"]) for run in runs] == [(name, True) for name in names]
+    for number, run in enumerate(runs):
+        expected = [{"loss": number + 0.5, "step": number + step} for step in (10, 20)]
+        assert run["rows"] == expected
+    assert len({run["id"] for run in runs}) == 3
+    assert {path.name for path in tmp_path.iterdir()} == {"home", "run"}
+
+
+@pytest.mark.slow
+def test_a_run_that_goes_on_continues_its_own_wandb_run_whatever_a_batch_script_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("wandb")
+    offline(monkeypatch, tmp_path / "home")
+    monkeypatch.setenv("WANDB_RUN_ID", "one-for-all")
+    for step in (0, 20):
+        for folder in ("a", "b"):
+            logger = make_logger("wandb", tmp_path / folder, "bcq_lift", step)
+            log_metrics(logger, {"loss": step / 4}, step + 10)
+            close_logger(logger)
+        time.sleep(1.1)  # wandb's folders have the second of their start in their names
+    a, b = (read_runs(tmp_path / folder) for folder in ("a", "b"))
+    for both in (a, b):
+        assert [run["rows"] for run in both] == [
+            [{"loss": 0.0, "step": 10}],
+            [{"loss": 5.0, "step": 30}],
+        ]
+        assert both[0]["id"] == both[1]["id"]
+    assert a[0]["id"] != b[0]["id"]
+
+
+@pytest.mark.parametrize("text", ["../../elsewhere", "", "\0", "A" * 16, "a" * 17])
+def test_an_id_that_is_none_of_ours_gets_no_further(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "logs" / "bcq_lift" / "wandb_id"
+    write_atomic(path, text)
+    known = runs._wandb_id(path)
+    assert re.fullmatch("[0-9a-f]{16}", known)
+    assert runs._wandb_id(path) == known
 
 
 def test_an_unknown_logger_is_refused_with_the_valid_ones(tmp_path: Path) -> None:
@@ -369,7 +402,7 @@ def test_a_logger_that_cannot_be_made_is_said_and_csv_files_take_its_place(
         return make(name, *arguments, **options)
 
     monkeypatch.setattr(loggers, "get_logger", unreachable)
-    monkeypatch.setattr(runs, "_wandb_options", lambda run_dir: {})
+    monkeypatch.setattr(runs, "_wandb_options", lambda run_dir, name: {})
     logger = make_logger(kind, tmp_path, "bcq_lift")
     log_metrics(logger, {"loss": 0.5}, 10)
     said = capsys.readouterr().err
@@ -394,6 +427,17 @@ def test_a_logger_that_fails_later_is_said_once_and_the_run_goes_on(
     other = make_logger("csv", tmp_path, "bcq_reach")
     log_metrics(other, {"loss": 0.5}, 10)
     assert (tmp_path / "logs" / "bcq_reach" / "scalars" / "loss.csv").exists()
+
+
+def test_a_logger_that_cannot_end_is_said_and_the_run_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    close_logger(None)
+    logger = make_logger("csv", tmp_path, "bcq_lift")
+    monkeypatch.setattr(logger, "close", Mock(side_effect=ConnectionError("no route to host")))
+    close_logger(logger)
+    said = capsys.readouterr().err
+    assert said == "the end of the metrics may be missing (no route to host)\n"
 
 
 @pytest.mark.parametrize("torn", ["", "4", "40,0.", "\0\0\0\n", "40,0.25"])

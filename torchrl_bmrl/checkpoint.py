@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,6 +19,7 @@ from torchrl_bmrl import __version__
 from torchrl_bmrl.errors import CheckpointError
 from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import link_or_copy, write_atomic
+from torchrl_bmrl.messages import say
 from torchrl_bmrl.training import get_rng_state, load_adam, set_rng_state
 
 with needs("recipes"):
@@ -165,7 +165,7 @@ def load_newest(path: Path, *, kind: str) -> tuple[State, Metadata] | None:
             continue
         _of_kind(file, metadata, kind)
         if damaged:
-            print(f"{damaged[0]}; going on from {file.name}", file=sys.stderr, flush=True)
+            say(f"{damaged[0]}; going on from {file.name}")
             for bad in damaged:
                 os.replace(bad.path, path.with_name(f"{path.stem}.damaged{path.suffix}"))
         if file != path:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import signal
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
 
 from torchrl_bmrl.errors import BMRLError, StoppedError
+from torchrl_bmrl.messages import say
 from torchrl_bmrl.stops import stop_on_signals
 
 _KEPT = "what was done is kept, the same command goes on"
@@ -44,32 +44,28 @@ def exit_codes(*, out_of_memory: str = "") -> Iterator[None]:
         with stop_on_signals():
             yield
     except StoppedError as stop:
-        _say(str(stop))
+        say(str(stop))
         raise SystemExit(128 + stop.signal) from stop
     except KeyboardInterrupt as interrupt:  # the second signal
-        _say(f"interrupted; {_KEPT}")
+        say(f"interrupted; {_KEPT}")
         raise SystemExit(128 + signal.SIGINT) from interrupt
     except BMRLError as error:
-        _say(f"error: {error}")
+        say(f"error: {error}")
         raise SystemExit(1) from error
     except torch.OutOfMemoryError as error:
         reason = str(error).strip().partition("\n")[0]
-        _say(f"error: {'; '.join(filter(None, [reason, out_of_memory, _KEPT]))}")
+        say(f"error: {'; '.join(filter(None, [reason, out_of_memory, _KEPT]))}")
         raise SystemExit(1) from error
     except MemoryError as error:
-        _say(f"error: out of memory; {_LESS}; {_KEPT}")
+        say(f"error: out of memory; {_LESS}; {_KEPT}")
         raise SystemExit(1) from error
     except RuntimeError as error:
         if "can't allocate memory" not in str(error):  # which PyTorch says of the CPU's
             raise
-        _say(f"error: out of memory; {_LESS}; {_KEPT}")
+        say(f"error: out of memory; {_LESS}; {_KEPT}")
         raise SystemExit(1) from error
     except OSError as error:
         reason = error.strerror or str(error) or type(error).__name__
         path = f"{error.filename}: " if error.filename is not None else ""
-        _say(f"error: {path}{reason}; {_KEPT}")
+        say(f"error: {path}{reason}; {_KEPT}")
         raise SystemExit(1) from error
-
-
-def _say(message: str) -> None:
-    print(message, file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""Jobs over worker processes under one progress bar."""
+"""Jobs over worker processes, and one account of how far they are."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import hashlib
 import multiprocessing
 import os
 import signal
-import sys
 import threading
 import time
 import traceback
@@ -21,11 +20,9 @@ from typing import Any, TypeVar
 import torch
 
 from torchrl_bmrl.errors import BMRLError, StoppedError
-from torchrl_bmrl.extras import needs
+from torchrl_bmrl.messages import say
+from torchrl_bmrl.progress import Progress, progress
 from torchrl_bmrl.stops import check_stop, note_signal
-
-with needs("recipes"):
-    from tqdm import tqdm
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -81,9 +78,9 @@ def run_jobs(
         function: what to do with a job; it calls ``report(n)`` as it advances.
         jobs: its arguments.
         workers: processes; 1 runs everything here.
-        total: units over all jobs, for the progress bar and its time left.
-        description: what the bar says.
-        unit: what it counts.
+        total: units over all jobs, for the time left (:func:`~torchrl_bmrl.progress.progress`).
+        description: what the jobs do.
+        unit: what they count, in the singular.
 
     Raises:
         BMRLError: if a job's workers die three times.
@@ -98,7 +95,7 @@ def run_jobs(
     jobs = list(jobs)
     if not jobs:
         return []
-    with tqdm(total=total, desc=description, unit=unit, disable=None) as bar:
+    with progress(total, description, unit) as bar:
         if min(workers, len(jobs)) <= 1:
 
             def report(units: int) -> None:
@@ -200,7 +197,7 @@ def _run_in_processes(
     function: Callable[[Job, Report], Result],
     jobs: list[Job],
     workers: int,
-    bar: tqdm,
+    bar: Progress,
     description: str,
 ) -> list[Result]:
     waiting, deaths = deque(range(len(jobs))), Counter[int]()
@@ -239,7 +236,7 @@ def _run_in_processes(
                             f"{what}, the {TRIES}rd time; what was finished is kept, the same "
                             "command goes on"
                         )
-                    tqdm.write(f"{what}; the job is done again", file=sys.stderr)
+                    say(f"{what}; the job is done again")
                     waiting.appendleft(number)
                 else:
                     results[number] = value

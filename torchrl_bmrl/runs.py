@@ -7,8 +7,9 @@ import json
 import math
 import os
 import platform
+import re
 import subprocess
-import sys
+import uuid
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from torchrl_bmrl import __version__
 from torchrl_bmrl.errors import ConfigError, DataError, UnknownNameError
 from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import link_or_copy, read_json, write_atomic
+from torchrl_bmrl.messages import say
 
 with needs("recipes"):
     import yaml
@@ -242,7 +244,8 @@ def make_logger(kind: str, run_dir: Path, name: str, step: int = 0) -> Any:
 
     Returns:
         a :class:`torchrl.record.loggers.Logger`, or ``None`` for ``"none"``. Weights & Biases runs
-        offline where no account is configured, unless ``WANDB_MODE`` says otherwise.
+        offline where no account is configured, unless ``WANDB_MODE`` says otherwise. Every name of
+        a run folder is a run of its own there, which a run that goes on continues.
 
     Raises:
         UnknownNameError: for another kind.
@@ -263,10 +266,10 @@ def make_logger(kind: str, run_dir: Path, name: str, step: int = 0) -> Any:
     folder = run_dir / "logs"
     if kind != "csv":
         try:
-            options = {"wandb_kwargs": _wandb_options(run_dir)} if kind == "wandb" else {}
+            options = {"wandb_kwargs": _wandb_options(run_dir, name)} if kind == "wandb" else {}
             return get_logger(kind, str(folder), name, **options)
         except Exception as error:  # whatever a server or its library may come up with
-            _say(f"{name}: no {kind} ({_first_line(error)}); metrics go to CSV files in {folder}")
+            say(f"{name}: no {kind} ({_first_line(error)}); metrics go to CSV files in {folder}")
     for path in (folder / name / "scalars").glob("*.csv"):
         rows = path.read_text(encoding="utf-8").splitlines(keepends=True)
         kept = [row for row in rows if row.endswith("\n") and _step(row) <= step]
@@ -275,12 +278,28 @@ def make_logger(kind: str, run_dir: Path, name: str, step: int = 0) -> Any:
     return get_logger("csv", str(folder), name)
 
 
-def _wandb_options(run_dir: Path) -> dict[str, Any]:
+def _wandb_options(run_dir: Path, name: str) -> dict[str, Any]:
     with needs("recipes"):
         import wandb
 
     mode = os.environ.get("WANDB_MODE") or ("online" if wandb.api.api_key else "offline")
-    return {"mode": mode, "project": "torchrl_bmrl", "dir": str(run_dir)}
+    return {
+        "mode": mode,
+        "project": "torchrl_bmrl",
+        "dir": str(run_dir),
+        "id": _wandb_id(run_dir / "logs" / name / "wandb_id"),
+        # Else wandb gives every logger of a process the run of the first one.
+        "reinit": "create_new",
+    }
+
+
+def _wandb_id(path: Path) -> str:
+    """Of the run that a logger began or goes on with; kept beside its metrics."""
+    known = path.read_text(encoding="utf-8", errors="replace").strip() if path.is_file() else ""
+    if not re.fullmatch("[0-9a-f]{16}", known):  # wandb makes a folder of it
+        known = uuid.uuid4().hex[:16]
+        write_atomic(path, known + "\n")
+    return known
 
 
 def _step(row: str) -> float:
@@ -314,7 +333,28 @@ def log_metrics(logger: Any, metrics: Mapping[str, Any], step: int) -> None:
             logger.log_scalar(name, float(value), step=step)
     except Exception as error:
         _lost.add(logger)
-        _say(f"metrics are logged no more, from step {step} on ({_first_line(error)})")
+        say(f"metrics are logged no more, from step {step} on ({_first_line(error)})")
+
+
+def close_logger(logger: Any) -> None:
+    """Ends a logger: what it holds is written, and a run of Weights & Biases is finished.
+
+    One that fails is reported on stderr; nothing depends on it.
+
+    Args:
+        logger: of :func:`make_logger`; ``None`` for none.
+
+    Example:
+        >>> import tempfile
+        >>> logger = make_logger("csv", Path(tempfile.mkdtemp()), "bcq_lift")
+        >>> close_logger(logger)
+    """
+    if logger is None:
+        return
+    try:
+        logger.close()
+    except Exception as error:
+        say(f"the end of the metrics may be missing ({_first_line(error)})")
 
 
 _lost: WeakSet[Any] = WeakSet()
@@ -323,7 +363,3 @@ _lost: WeakSet[Any] = WeakSet()
 
 def _first_line(error: Exception) -> str:
     return str(error).strip().partition("\n")[0] or type(error).__name__
-
-
-def _say(message: str) -> None:
-    print(message, file=sys.stderr, flush=True)

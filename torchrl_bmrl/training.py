@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import sys
 import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -15,6 +14,7 @@ from torch.optim import Adam
 from torch.optim.adam import adam
 
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.messages import say
 
 Metrics = dict[str, Tensor]
 Update = Callable[[TensorDictBase], Metrics]
@@ -285,13 +285,13 @@ def accelerate(
     """
     on_gpu = torch.device(device).type == "cuda"
     if captured and not on_gpu:
-        _say(f"device={device} has no CUDA graphs; the updates run without")
+        say(f"device={device} has no CUDA graphs; the updates run without")
         captured = False
     if not compiled and not captured:
         return update
     fast = update
     if compiled:
-        _say("compiling the updates, which takes about half a minute")
+        say("compiling the updates, which takes about half a minute")
         fast = _Compiled(update, on_gpu)
     return _WithFallback(_Captured(fast) if captured else fast, update)
 
@@ -319,10 +319,6 @@ class _Compiled:
             return self.update(batch)
 
 
-def _say(message: str) -> None:
-    print(message, file=sys.stderr, flush=True)
-
-
 class _WithFallback:
     """Runs the fast version; if its first calls fail, the plain one from then on."""
 
@@ -341,7 +337,7 @@ class _WithFallback:
             # A program that cannot be made has not run in part; what an eager update before a
             # capture cannot do, the plain one cannot either, and it says so itself.
             reason = str(error).strip().partition("\n")[0]
-            _say(f"updates are not accelerated ({type(error).__name__}: {reason}); they run as is")
+            say(f"updates are not accelerated ({type(error).__name__}: {reason}); they run as is")
             self.fast, self.left = self.plain, 0
             return self.plain(batch)
 

@@ -22,11 +22,8 @@ from torchrl_bmrl.data.options import LastStep, ReadOptions, Reward
 from torchrl_bmrl.data.robosuite import Relabelling
 from torchrl_bmrl.data.schema import Summary, summarise
 from torchrl_bmrl.data.sources import Source, open_source
-from torchrl_bmrl.extras import needs
 from torchrl_bmrl.names import TASKS
-
-with needs("data"):
-    from tqdm import tqdm
+from torchrl_bmrl.progress import progress
 
 
 def describe(source: Source, summary: Summary) -> Iterator[str]:
@@ -92,7 +89,7 @@ def check(options: argparse.Namespace) -> int:
     """Prints a summary, the warnings and everything that is wrong; 1 if something is."""
     relabelled = []
     with open_source(options.file, **reading(options)) as source:
-        with tqdm(total=len(source.episodes), unit="episode", delay=2, leave=False) as bar:
+        with progress(len(source.episodes), "reading", "episode", delay=2, leave=False) as bar:
 
             def look(name: str, episode: Episode | None) -> None:
                 if source.format == "robosuite" and episode is not None:
@@ -123,7 +120,7 @@ def check(options: argparse.Namespace) -> int:
 
 def convert_command(options: argparse.Namespace) -> int:
     """Converts under a progress bar."""
-    with tqdm(unit="episode", delay=2, leave=False) as bar:
+    with progress(None, "converting", "episode", delay=2, leave=False) as bar:
         done = convert(
             options.source,
             options.out,
