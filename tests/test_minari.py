@@ -24,8 +24,16 @@ from tensordict import TensorDict
 from torchrl.data.datasets.minari_data import MinariExperienceReplay
 
 from torchrl_bmrl.data.episodes import Episode, as_tensordict, stack_episodes
-from torchrl_bmrl.data.minari import join_observations, new_folder, open_episodes, write_episodes
-from torchrl_bmrl.errors import BMRLError, DataError
+from torchrl_bmrl.data.minari import (
+    find_oddities,
+    join_observations,
+    new_folder,
+    open_episodes,
+    open_raw,
+    read_metadata,
+    write_episodes,
+)
+from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
 
 ID = "sawyer/lift-v0"
 Damage = Callable[[Path], None]
@@ -318,6 +326,200 @@ def test_spaces_without_named_arrays_are_refused(
         read(root / ID)
 
 
+# -- Minari's JPEG ---------------------------------------------------------------------------------
+
+
+def smooth(*shape: int) -> np.ndarray:
+    """Images that JPEG keeps to a few bits."""
+    return (np.arange(np.prod(shape)) // 3 % 200).astype(np.uint8).reshape(shape)
+
+
+SHAPES = {
+    "a vector": (5,),
+    "a small picture": (8, 9),
+    "a small picture in colours": (8, 8, 3),
+    "a picture": (40, 36, 3),
+}
+COMPRESSES_ALL = minari.__version__ == "0.5.3"
+
+
+@pytest.mark.skipif(not COMPRESSES_ALL, reason="Minari 0.5.3 alone compresses all of them")
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_bytes_that_minari_made_jpeg_of_are_images_again(
+    root: Path, shape: tuple[int, ...]
+) -> None:
+    pixels = smooth(4, *shape)
+    space = gym.Dict(pixels=gym.Box(0, 255, shape, np.uint8), other=BOXES[0])
+    buffer = make_buffer(3, observations={"pixels": pixels, "other": np.zeros((4, 4))})
+    write_with_minari(space, BOXES[1], buffer)
+    with h5py.File(root / ID / "data" / "main_data.hdf5") as file:
+        assert file["episode_0/observations/pixels"].shape[1:] != shape  # of bytes
+    (episode,) = read(root / ID)
+    ours = episode.observations["pixels"]
+    assert (ours.dtype, ours.shape) == (np.uint8, (3, *shape))
+    # Colours are kept at half the resolution.
+    assert np.abs(ours.astype(int) - pixels[:-1]).mean() < (25 if len(shape) == 3 else 3)
+    assert find_oddities(root / ID) == [
+        "observations/pixels: stored as JPEG, which loses bits in 1 episodes, such as episode_0"
+    ]
+    minaris = next(iter(minari.load_dataset(ID))).observations["pixels"]
+    assert (minaris.shape == pixels.shape) == (min(shape[:2]) >= 32)
+
+
+@pytest.mark.skipif(not COMPRESSES_ALL, reason="Minari 0.5.3 alone compresses small ones")
+def test_pictures_of_any_length_in_bytes_are_read(root: Path) -> None:
+    rng = np.random.default_rng(0)
+    pixels = (rng.integers(0, 256, (4, 8, 9)) * np.arange(4)[:, None, None] / 3).astype(np.uint8)
+    space = gym.Dict(pixels=gym.Box(0, 255, (8, 9), np.uint8))
+    write_with_minari(space, BOXES[1], make_buffer(3, observations={"pixels": pixels}))
+    with h5py.File(root / ID / "data" / "main_data.hdf5") as file:
+        assert file["episode_0/observations/pixels"].dtype == object
+    (episode,) = read(root / ID)
+    assert episode.observations["pixels"].shape == (3, 8, 9)
+    assert not episode.observations["pixels"][0].any()
+
+
+@pytest.mark.skipif(not COMPRESSES_ALL, reason="Minari 0.5.3 alone compresses small ones")
+def test_jpeg_of_another_shape_than_the_space_is_refused(root: Path) -> None:
+    space = gym.Dict(pixels=gym.Box(0, 255, (8, 9), np.uint8))
+    buffer = make_buffer(3, observations={"pixels": smooth(4, 9, 8)})
+    write_with_minari(space, BOXES[1], buffer)
+    message = (
+        r"episode_0/observations/pixels: JPEG of shape \(9, 8\) in row 0; valid: \(8, 9\), as "
+        "metadata.json says"
+    )
+    with pytest.raises(DataError, match=message):
+        read(root / ID)
+
+
+def test_jpeg_that_is_cut_off_is_refused(root: Path) -> None:
+    space = gym.Dict(pixels=gym.Box(0, 255, (40, 40), np.uint8))
+    write_with_minari(space, BOXES[1], make_buffer(3, observations={"pixels": smooth(4, 40, 40)}))
+    key = "episode_0/observations/pixels"
+    with h5py.File(root / ID / "data" / "main_data.hdf5") as file:
+        rows = [row[: len(row) // 2] for row in file[key][()]]
+    pixels = np.empty(4, object)
+    pixels[:] = rows
+    with h5py.File(root / ID / "data" / "main_data.hdf5", "r+") as file:
+        del file[key]
+        file.create_dataset(key, data=pixels, dtype=h5py.vlen_dtype(np.uint8))
+    with pytest.raises(DataError, match=f"{key}: no JPEG in row 0"):
+        read(root / ID)
+
+
+def test_bytes_that_were_meant_as_bytes_stay_what_they_are(root: Path) -> None:
+    space = gym.Dict(a=gym.Box(0, 255, (423,), np.uint8))
+    buffer = make_buffer(3, observations={"a": np.zeros((4, 423))})
+    write_with_minari(space, BOXES[1], buffer)
+    content = np.zeros((4, 423), np.uint8)
+    content[:, :3] = 0xFF, 0xD8, 0xFF  # as a JPEG begins
+    # A whole JPEG of 8 by 9 pixels in as many bytes: not the space's shape.
+    with h5py.File(root / ID / "data" / "main_data.hdf5", "r+") as file:
+        from minari.dataset._storages.hdf5_storage import encode_frame
+
+        jpeg = encode_frame(smooth(8, 9))
+        content[:, : len(jpeg)] = jpeg
+        del file["episode_0/observations/a"]
+        file["episode_0/observations/a"] = content
+    (episode,) = read(root / ID)
+    assert_same(episode.observations["a"], content[:-1])
+
+
+# -- spaces and bounds -----------------------------------------------------------------------------
+
+
+def write_actions(space: gym.Space, actions: np.ndarray) -> None:
+    write_with_minari(BOXES[0], space, make_buffer(3, actions=actions))
+
+
+@pytest.mark.parametrize(
+    ("space", "actions", "message"),
+    [
+        (gym.Discrete(3), np.array([0, 3, 1]), r"actions: 3 in row 1 is outside \[0, 2\], its"),
+        (gym.Discrete(3, start=1), np.array([1, 3, 0]), r"0 in row 2 is outside \[1, 3\]"),
+        (gym.Discrete(3), np.zeros(3), "actions: dtype float64; valid: int64, as metadata.json"),
+        (gym.Discrete(3), np.zeros((3, 1), int), r"shape \(3, 1\); valid: \(T\)"),
+        (gym.MultiDiscrete([2, 3]), np.array([[1, 2], [2, 0], [0, 0]]), r"2 in row 1 .*\[0, 1\]"),
+        (gym.MultiBinary(2), np.full((3, 2), 2, np.int8), r"2 in row 0 is outside \[0, 1\]"),
+        (
+            gym.Box(np.array([-np.inf, 0]), np.array([np.inf, 1]), dtype=np.float64),
+            np.array([[5, 0.5], [5, 1.5], [0, 0]]),
+            r"1.5 in row 1 is outside \[0.0, 1.0\]",
+        ),
+        (gym.Box(-3, 3, (2,), int), np.full((3, 2), 4), r"4 in row 0 is outside \[-3, 3\]"),
+    ],
+    ids=["n", "start", "floats", "a column", "several", "binary", "half a box", "integers"],
+)
+def test_actions_that_are_not_of_their_space_are_refused(
+    root: Path, space: gym.Space, actions: np.ndarray, message: str
+) -> None:
+    write_actions(space, actions)
+    with pytest.raises(DataError, match=message):
+        read(root / ID)
+
+
+@pytest.mark.parametrize(
+    ("space", "actions"),
+    [
+        (gym.Discrete(3), np.array([0, 2, 1])),
+        (gym.MultiDiscrete([2, 3]), np.array([[1, 2], [0, 0], [1, 1]])),
+        (gym.MultiBinary(2), np.ones((3, 2), np.int8)),
+        (gym.Box(-3, 3, (2, 2)), np.full((3, 2, 2), 3, np.float32)),
+    ],
+    ids=["discrete", "several", "binary", "a matrix"],
+)
+def test_actions_of_any_space_come_back_and_state_no_bounds(
+    root: Path, space: gym.Space, actions: np.ndarray
+) -> None:
+    write_actions(space, actions)
+    (episode,) = read(root / ID)
+    assert_same(episode.actions, actions)
+    assert "action_bounds" not in read_metadata(root / ID)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "stated"),
+    [
+        (-2, 2, {"low": -2.0, "high": 2.0}),
+        ([-2, -1], [2, 0.5], {"low": [-2.0, -1.0], "high": [2.0, 0.5]}),
+        ([-2, -1], 3, {"low": [-2.0, -1.0], "high": 3.0}),
+        (-np.inf, 2, None),
+        ([-1, -1], [1, np.inf], None),
+        (-float(np.finfo(np.float32).max), float(np.finfo(np.float32).max), None),
+        (-1, [1, -1], None),  # one action alone
+    ],
+)
+def test_a_finite_box_states_the_bounds_of_actions(
+    root: Path, low: Any, high: Any, stated: dict[str, Any] | None
+) -> None:
+    ends = [np.broadcast_to(np.float32(end), 2) for end in (low, high)]
+    write_actions(gym.Box(*ends, dtype=np.float32), np.full((3, 2), -1, np.float32))
+    assert read_metadata(root / ID).get("action_bounds") == stated
+
+
+def test_bounds_are_written_as_the_space_and_read_again(root: Path) -> None:
+    bounds = ([-2.0] * 7, [3.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+    write_episodes(root / ID, make_episodes(), bounds=bounds)
+    space = minari.load_dataset(ID).action_space
+    assert space == gym.Box(np.float32(bounds[0]), np.float32(bounds[1]), dtype=np.float32)
+    assert read_metadata(root / ID)["action_bounds"] == {"low": -2.0, "high": bounds[1]}
+
+
+def test_without_bounds_the_space_has_none(path: Path) -> None:
+    assert not minari.load_dataset(ID).action_space.is_bounded()
+    assert "action_bounds" not in read_metadata(path)
+
+
+def test_bounds_that_do_not_fit_are_refused(root: Path) -> None:
+    with pytest.raises(DataError, match=r"episode_0/actions: .* is outside \[-0.1, 0.1\]"):
+        write_episodes(root / ID, make_episodes(), bounds=(-0.1, 0.1))
+    with pytest.raises(ConfigError, match=r"bounds is .*; valid: two finite numbers"):
+        write_episodes(root / ID, make_episodes(), bounds=(1, -1))
+    with pytest.raises(DataError, match=r"episode_0/actions: shape \(5, 7\), and bounds of 2"):
+        write_episodes(root / ID, make_episodes(), bounds=([-1, -1], 1))
+    assert list((root / "sawyer").iterdir()) == []
+
+
 # -- refused when writing --------------------------------------------------------------------------
 
 
@@ -482,11 +684,15 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
     "half metadata": (overwrite("metadata.json", b'{"total'), "metadata.json: not Minari's"),
     "a list": (overwrite("metadata.json", b"[]"), "metadata.json: not Minari's metadata"),
     "no space": (change_metadata(observation_space=None), "observation_space: missing"),
-    "no count": (change_metadata(total_episodes=None), "total_episodes: missing"),
-    "count of 0": (change_metadata(total_episodes=0), "total_episodes: 0; valid: 1 and more"),
-    "another count": (change_metadata(total_episodes=2), "valid: episode_0 to episode_1"),
+    "no part in the space": (
+        change_metadata(observation_space='{"type": "Dict", "subspaces": {}}'),
+        "observation_space: no part; valid: at least one",
+    ),
     "Arrow": (change_metadata(data_format="arrow"), "data_format: 'arrow'; valid: 'hdf5'"),
-    "no episode": (remove("episode_1"), "valid: episode_0 to episode_2"),
+    "no episodes": (
+        change_file(lambda file: file.clear()),
+        "main_data.hdf5: no episodes; valid: at least episode_0",
+    ),
     "no rewards": (remove("episode_1/rewards"), "episode_1/rewards: missing"),
     "no part": (remove("episode_1/observations/joints"), "observations/joints: missing"),
     "no flags": (remove("episode_1/truncations"), "episode_1/truncations: missing"),
@@ -499,8 +705,31 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
         replace("episode_1/infos/success", np.zeros(3)),
         "success: .*valid: 7 or 8 rows",
     ),
-    "no step": (replace("episode_1/actions", np.zeros((0, 7))), "actions: .*at least one row"),
-    "a number": (replace("episode_1/actions", 3.0), "actions: .*at least one row"),
+    "no action": (
+        replace("episode_1/actions", np.zeros((0, 7))),
+        r"episode_1/actions: shape \(0, 7\); valid: 7 rows, since most arrays are of 7",
+    ),
+    "a number": (replace("episode_1/actions", 3.0), "actions: one number; valid: a row for each"),
+    "half an action more": (
+        replace("episode_1/actions", np.zeros((7, 8), np.float32)),
+        r"episode_1/actions: shape \(7, 8\); valid: \(T, 7\), as metadata.json says",
+    ),
+    "actions of integers": (
+        replace("episode_1/actions", np.zeros((7, 7), int)),
+        "episode_1/actions: dtype int64; valid: float32, as metadata.json says",
+    ),
+    "a part of other rows": (
+        replace("episode_1/observations/joints", np.zeros((8, 3), np.float32)),
+        r"observations/joints: shape \(8, 3\); valid: \(T, 7\), as metadata.json says",
+    ),
+    "a part of floats": (
+        replace("episode_1/observations/touch", np.zeros((8, 4))),
+        "observations/touch: dtype float64; valid: int32, as metadata.json says",
+    ),
+    "half an end": (
+        replace("episode_1/terminations", np.linspace(0, 0.5, 7)),
+        "episode_1/terminations: 0.083.* in row 1; valid: 0 or 1",
+    ),
     "text": (replace("episode_1/rewards", b"abc"), "episode_1/rewards: dtype"),
     "infos are an array": (replace("episode_1/infos", np.zeros(7)), "episode_1/infos: not a group"),
     "an early end": (
@@ -526,6 +755,27 @@ def test_one_damaged_episode_leaves_the_others_readable(path: Path) -> None:
             episodes["episode_1"]
 
 
+def test_a_hole_in_the_file_is_found(path: Path) -> None:
+    file = path / "data" / "main_data.hdf5"
+    with h5py.File(file) as opened:
+        chunk = opened["episode_1/observations/eef_pos"].id.get_chunk_info(0)
+    content = bytearray(file.read_bytes())
+    content[chunk.byte_offset : chunk.byte_offset + chunk.size] = bytes(chunk.size)
+    file.write_bytes(content)
+    with pytest.raises(DataError, match="episode_1/observations/eef_pos: unreadable"):
+        read(path)
+
+
+def test_files_are_written_as_older_versions_of_hdf5_read_them(path: Path) -> None:
+    # Superblock 3 is of HDF5 1.10, and layouts of datasets are of version 4: see the message "bad
+    # version number for layout message" that newer ones meet in libraries before HDF5 2.
+    content = (path / "data" / "main_data.hdf5").read_bytes()
+    assert content[:9] == b"\x89HDF\r\n\x1a\n\x03"
+    with h5py.File(path / "data" / "main_data.hdf5") as file:
+        assert file["episode_0/actions"].compression == "gzip"
+        assert file["episode_0/actions"].fletcher32
+
+
 def test_a_flipped_bit_never_becomes_another_number(root: Path) -> None:
     # Strings of any length have no checksums in HDF5: attributes are numbers here.
     made = [with_parts(episode, attributes={"seed": 3}) for episode in make_episodes()]
@@ -545,3 +795,120 @@ def test_a_flipped_bit_never_becomes_another_number(root: Path) -> None:
         for ours, theirs in zip(episodes, made, strict=True):
             assert_same_episodes(ours, theirs)
     assert refused > 40
+
+
+# -- what is beside, and what contradicts ----------------------------------------------------------
+
+
+def test_what_is_not_read_is_named(path: Path) -> None:
+    with h5py.File(path / "data" / "main_data.hdf5", "r+") as file:
+        group = file["episode_1"]
+        group["camera"] = np.zeros(7)
+        group["observations/video"] = np.zeros((8, 3))
+        group["infos/nested/x"] = np.zeros(8)
+        group["infos/note"] = [b"a"] * 8
+        group["infos/other"] = np.zeros(3)
+        group["infos/number"] = 3.0
+        group["infos/rewards"] = np.zeros(8)  # a name of robomimic's layout
+        group["infos/successes"] = np.zeros(8)  # success is there as well
+        file["notes/x"] = np.zeros(3)
+        file["episode_01"] = 3.0
+    with open_raw(path) as episodes:
+        assert list(episodes) == ["episode_0", "episode_1", "episode_2"]
+        assert episodes["episode_0"].left_alone == ()
+        assert set(episodes["episode_1"].extras) == {"successes", "phases", "states"}
+        assert episodes["episode_1"].left_alone == (
+            "camera",
+            *(f"infos/{name}" for name in ("nested", "note", "number", "other", "rewards")),
+            "infos/successes",
+            "observations/video",
+        )
+    with open_episodes(path) as episodes:
+        assert episodes["episode_1"].left_out.arrays[0] == "camera"
+        assert_same_episodes(episodes["episode_1"], make_episodes()[1])
+    assert find_oddities(path) == ["beside the episodes, left alone: 'episode_01', 'notes'"]
+
+
+def test_parts_that_are_no_arrays_are_left_alone_where_others_are(root: Path) -> None:
+    space = gym.Dict(a=gym.Text(3), b=BOXES[0], c=gym.Dict(d=BOXES[0]))
+    x = np.random.default_rng(0).random((4, 4))
+    observations = {"a": ["abc"] * 4, "b": x, "c": {"d": x}}
+    write_with_minari(space, BOXES[1], make_buffer(3, observations=observations))
+    with open_raw(root / ID) as episodes:
+        raw = episodes["episode_0"]
+        assert list(raw.observations) == ["b"]
+        assert_same(raw.observations["b"], x)
+        assert raw.left_alone == ("observations/a", "observations/c")
+
+
+def change_attribute(name: str, key: str, value: Any) -> Damage:
+    return change_file(lambda file: file[name].attrs.__setitem__(key, value))
+
+
+CONTRADICTIONS: dict[str, tuple[Damage, list[str]]] = {
+    "total_steps of an episode": (
+        change_attribute("episode_1", "total_steps", 9),
+        [
+            "the attribute total_steps contradicts name and arrays in 1 episodes, such as "
+            "episode_1 (9, not 7)"
+        ],
+    ),
+    "id": (
+        change_attribute("episode_2", "id", 0),
+        [
+            "the attribute id contradicts name and arrays in 1 episodes, such as episode_2 "
+            "(0, not 2)"
+        ],
+    ),
+    "total_steps": (
+        change_metadata(total_steps=15),
+        ["total_steps is 15 in metadata.json, the arrays have 16"],
+    ),
+    "total_episodes": (
+        change_metadata(total_episodes="four"),
+        ["total_episodes is 'four' in metadata.json, the arrays have 3"],
+    ),
+    "a missing episode": (
+        remove("episode_1"),
+        [
+            "1 episodes are missing, such as episode_1",
+            "total_episodes is 3 in metadata.json, the arrays have 2",
+            "total_steps is 16 in metadata.json, the arrays have 9",
+        ],
+    ),
+    "integers in a box of floats": (
+        replace("episode_0/observations/joints", np.zeros((6, 7), np.int16)),
+        [
+            "observations/joints: int16, though its space is of float32 in 1 episodes, such as "
+            "episode_0"
+        ],
+    ),
+    "no totals": (change_metadata(total_steps=None, total_episodes=None), []),
+}
+
+
+@pytest.mark.parametrize("case", CONTRADICTIONS)
+def test_what_contradicts_the_arrays_is_said_and_the_arrays_are_read(path: Path, case: str) -> None:
+    damage, oddities = CONTRADICTIONS[case]
+    assert find_oddities(path) == []
+    damage(path)
+    assert find_oddities(path) == oddities
+    lengths = [len(episode) for episode in read(path)]
+    assert lengths == ([5, 4] if case == "a missing episode" else [5, 7, 4])
+
+
+def test_an_info_that_minari_made_jpeg_of_is_left_alone(root: Path) -> None:
+    infos = {"mask": smooth(4, 5), "success": np.zeros(4, bool)}
+    write_with_minari(*BOXES, make_buffer(3, infos=infos))
+    with open_raw(root / ID) as episodes:
+        left_alone = ("infos/mask",) if COMPRESSES_ALL else ()
+        assert episodes["episode_0"].left_alone == left_alone
+    assert [line.partition(" in")[0] for line in find_oddities(root / ID)] == [
+        f"{key}: stored as JPEG, and left alone" for key in left_alone
+    ]
+
+
+def test_a_reward_of_another_layout_is_asked_for(path: Path) -> None:
+    remove("episode_1/rewards")(path)
+    with open_raw(path) as episodes:
+        assert episodes["episode_1"].rewards is None

@@ -1,5 +1,224 @@
-"""stub"""
+"""D4RL's flat HDF5 layout: all steps of a data set in one array each, read episode by episode.
+
+Layout of a file of N steps::
+
+    observations         (N, ...), or a group of named parts
+    actions              (N, action_dim), or (N,)
+    rewards              (N,)
+    terminals            (N,) 0 or 1: no value follows
+    timeouts             (N,) 0 or 1: the episode was cut; optional
+    next_observations    as observations; optional
+    infos/<name>         (N, ...)
+    metadata/<name>      texts and numbers about the data set
+
+Rows of one number may be ``(N, 1)`` as well. What else has N rows of numbers is kept as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from torchrl_bmrl.data.d4rl_layout import (
+    AFTER,
+    ARRAYS,
+    BEFORE,
+    Flat,
+    as_column,
+    check_flags,
+    find_jumps,
+    walk,
+)
+from torchrl_bmrl.data.episodes import LazyEpisodes
+from torchrl_bmrl.data.hdf5 import (
+    open_file,
+    read_array,
+    read_attributes,
+    read_names,
+    read_node,
+    read_strings,
+)
+from torchrl_bmrl.data.raw import RawEpisode
+from torchrl_bmrl.errors import DataError
 
 
-def is_d4rl(path, file):
-    return False
+def is_d4rl(path: str | Path, file: h5py.File) -> bool:
+    """Whether the arrays of a file lie flat at its top."""
+    present = set(read_names(path, file, "/"))
+    return "data" not in present and len(present & {BEFORE, *ARRAYS}) > 1
+
+
+@contextmanager
+def open_raw(path: str | Path, *, horizon: int | None = None) -> Iterator[Mapping[str, RawEpisode]]:
+    """Opens a file; an episode is read when it is asked for, and no other row with it.
+
+    An episode ends at a terminal and at a timeout. In files without ``timeouts`` it ends at a
+    terminal and after ``horizon`` steps, which is how D4RL's own tools cut; without a horizon, at a
+    terminal and where the next observation is not the next row's. Files without any of the three
+    are refused: their episodes cannot be told from each other. The rows after the last end are an
+    episode, too, which was cut.
+
+    ``infos/<name>`` becomes the extra ``<name>``, and ``infos/<a>/<b>`` the extra ``<a>_<b>``;
+    ``success``, row t after step t, becomes ``successes``. What is not read is named in
+    ``left_alone``.
+
+    Args:
+        path: the HDF5 file; it is only read.
+        horizon: steps of the longest episode, for files without ``timeouts``. One of N steps or
+            more says that terminals alone end episodes.
+
+    Yields:
+        the episodes by their rows, ``rows_0_to_199``, ...; to be read inside the block.
+        ``next_observations`` is ``None`` where the file has none.
+
+    Raises:
+        DataError: naming file, key and the file's own row, for a file that is missing or damaged,
+            arrays that are missing or of different lengths, ends that cannot be known, flags other
+            than 0 and 1, and numbers that are not finite. The last is raised when the episode is
+            read.
+        ConfigError: for a horizon below 1, or of a file with ``timeouts``.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "hopper.hdf5"
+        >>> with h5py.File(path, "w") as file:
+        ...     file["observations"], file["actions"] = np.zeros((9, 3)), np.zeros((9, 2))
+        ...     file["rewards"], file["terminals"] = np.ones(9), np.arange(9) == 3
+        ...     file["timeouts"] = np.arange(9) == 6
+        >>> with open_raw(path) as episodes:
+        ...     {name: len(raw.actions) for name, raw in episodes.items()}
+        {'rows_0_to_3': 4, 'rows_4_to_6': 3, 'rows_7_to_8': 2}
+    """
+    with open_file(path) as file:
+        flat = Flat.of(path, file, horizon)
+        names = {f"rows_{rows.start}_to_{rows.stop - 1}": rows for rows in flat.episodes()}
+
+        def read(name: str) -> RawEpisode:
+            return _read_episode(path, file, flat, names[name])
+
+        yield LazyEpisodes(names, read)
+
+
+def read_metadata(path: str | Path) -> dict[str, Any]:
+    """What a file says about itself.
+
+    Returns:
+        ``attributes`` of the file, and ``metadata``: attributes, texts and numbers of the group of
+        that name, those of groups in it by their path.
+
+    Raises:
+        DataError: if the file is missing or damaged.
+    """
+    with open_file(path) as file:
+        told = {"attributes": read_attributes(path, file, "/"), "metadata": {}}
+        if isinstance(read_node(path, file, "metadata"), h5py.Group):
+            told["metadata"] = _read_group(path, file, "metadata")[0]
+        return told
+
+
+def find_oddities(path: str | Path, *, horizon: int | None = None) -> list[str]:
+    """What deserves a look in a file beside its episodes: warnings.
+
+    Args:
+        path: the HDF5 file.
+        horizon: as for :func:`open_raw`.
+
+    Raises:
+        DataError: as :func:`open_raw`.
+    """
+    with open_file(path) as file:
+        flat = Flat.of(path, file, horizon)
+        oddities = list(_end_oddities(path, file, flat, horizon))
+        if isinstance(read_node(path, file, "metadata"), h5py.Group):
+            beside = _read_group(path, file, "metadata")[1]
+            if beside:
+                oddities.append(
+                    f"{len(beside)} arrays below metadata are left alone, such as {beside[0]}"
+                )
+    return oddities
+
+
+def _end_oddities(
+    path: str | Path, file: h5py.File, flat: Flat, horizon: int | None
+) -> Iterator[str]:
+    if flat.timeouts is None and horizon is None:
+        yield (
+            "no timeouts: an episode ends at a terminal and where the next observation is not the "
+            "next row's"
+        )
+        if not flat.ends[:-1].any() and flat.steps > 1:
+            yield (
+                f"all {flat.steps} rows are one episode: if {AFTER} were made by shifting, ends "
+                "are hidden"
+            )
+    if not flat.ended:
+        first = flat.episodes()[-1].start
+        yield (
+            f"rows {first} to {flat.steps - 1} end in neither a terminal nor a timeout: read as an "
+            "episode that was cut"
+        )
+    if flat.timeouts is None:
+        return
+    if len(both := np.flatnonzero(flat.timeouts & flat.terminals)):
+        yield (
+            f"{len(both)} rows are terminal and timeout at once, such as {both[0]}: read as "
+            "terminal"
+        )
+    if flat.after:
+        cut = flat.timeouts & ~flat.terminals
+        cut[-1] = False  # nothing follows
+        wrong = np.flatnonzero(cut & ~find_jumps(path, file, flat))
+        if len(wrong):
+            yield (
+                f"at {len(wrong)} of {int(cut.sum())} timeouts, such as row {wrong[0]}, "
+                f"{AFTER} is the next episode's first observation: values bootstrapped from there "
+                f"are wrong, unless the episode went on; without {AFTER} these steps are left out"
+            )
+
+
+def _read_episode(path: str | Path, file: h5py.File, flat: Flat, rows: slice) -> RawEpisode:
+    def read(key: str) -> np.ndarray:
+        array = read_array(path, file, key, rows)
+        if array.dtype.kind == "f" and not (finite := np.isfinite(array)).all():
+            row = rows.start + int(np.argwhere(~finite)[0][0])
+            raise DataError(path, key, f"a value that is not finite in row {row}")
+        return array
+
+    actions = read("actions")
+    if actions.ndim == 1 and actions.dtype.kind == "f":  # else it is the number of a choice
+        actions = actions[:, None]
+    extras = {name: read(key) for name, key in flat.extras.items()}
+    if "successes" in extras:
+        key = flat.extras["successes"]
+        flags = as_column(path, key, extras["successes"])
+        extras["successes"] = check_flags(path, key, flags, rows.start)
+    return RawEpisode(
+        observations={part: read(key) for part, key in flat.parts.items()},
+        next_observations={part: read(key) for part, key in flat.after.items()} or None,
+        actions=actions,
+        rewards=as_column(path, "rewards", read("rewards")) if flat.rewards else None,
+        terminated=flat.terminals[rows],
+        extras=extras,
+        left_alone=flat.left_alone,
+    )
+
+
+def _read_group(path: str | Path, file: h5py.File, key: str) -> tuple[dict[str, Any], list[str]]:
+    """Attributes, texts and numbers of a group and of those in it, and keys of what is larger."""
+    told, beside = read_attributes(path, file, key), []
+    for where in walk(path, file, key):
+        node = read_node(path, file, where)
+        name = where.removeprefix(f"{key}/")
+        kind = node.dtype.kind if isinstance(node, h5py.Dataset) and node.shape == () else ""
+        if kind and kind in "OSU":
+            told[name] = read_strings(path, file, where)[0]
+        elif kind and kind in "biuf":
+            told[name] = read_array(path, file, where).item()
+        else:
+            beside.append(where)
+    return told, beside

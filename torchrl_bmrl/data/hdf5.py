@@ -98,8 +98,16 @@ def _natural(name: str) -> list[tuple[int, str]]:
     ]
 
 
-def read_array(path: str | Path, file: h5py.File, key: str) -> np.ndarray:
+def read_array(
+    path: str | Path, file: h5py.File, key: str, rows: slice | None = None
+) -> np.ndarray:
     """The numbers of a dataset.
+
+    Args:
+        path: of the file, for messages.
+        file: open for reading.
+        key: of the dataset.
+        rows: those to read; ``None`` for all.
 
     Raises:
         DataError: if it is missing, a group, cannot be read, or holds anything but numbers.
@@ -109,7 +117,7 @@ def read_array(path: str | Path, file: h5py.File, key: str) -> np.ndarray:
         if isinstance(node, h5py.Dataset):
             if node.dtype.kind not in "biuf":
                 raise DataError(path, key, f"dtype {node.dtype}; valid: numbers")
-            array = np.asarray(node[()])
+            array = np.asarray(node[() if rows is None else rows])
             return array.astype(array.dtype.newbyteorder("="), copy=False)  # as torch wants it
     except DataError:
         raise

@@ -1,4 +1,4 @@
-"""Data sets in Minari's HDF5 layout: written whole, checked, read one episode at a time.
+"""Data sets in Minari's HDF5 layout: written whole, read one episode at a time.
 
 Layout of the folder ``<namespace>/<name>-v<number>``::
 
@@ -15,31 +15,34 @@ Layout of the folder ``<namespace>/<name>-v<number>``::
 
 Minari compresses uint8 images to JPEG, which loses bits and which TorchRL cannot read. Images are
 therefore kept as they are and declared as boxes of int32, which no reader takes for JPEG.
+
+Version 0.5.3 of Minari (neither 0.5.2 nor 0.5.4) compresses every array of uint8 with two or three
+dimensions, small images and plain vectors among them, and returns the bytes of the JPEG where the
+space is no image. :func:`open_raw` finds them by their first bytes and decodes what has the space's
+shape.
 """
 
 from __future__ import annotations
 
-import io
-import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torchrl_bmrl.data.episodes import Episode, LazyEpisodes, join_observations
-from torchrl_bmrl.data.hdf5 import (
-    DAMAGE,
-    open_file,
-    read_array,
-    read_attributes,
-    read_names,
-    write_attributes,
+from torchrl_bmrl.data.episodes import Episode, join_observations
+from torchrl_bmrl.data.hdf5 import DAMAGE, write_attributes
+from torchrl_bmrl.data.minari_reader import (
+    OWN_ATTRIBUTES,
+    find_oddities,
+    open_episodes,
+    open_raw,
+    read_metadata,
 )
+from torchrl_bmrl.data.options import Bounds, check_bounds
 from torchrl_bmrl.data.schema import check_episode, check_fps, layout_of
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.extras import needs
@@ -48,11 +51,9 @@ from torchrl_bmrl.files import new_folder
 with needs("data"):
     import h5py
 
-_OWN_ATTRIBUTES = ("id", "total_steps")
-_SPACES = ("Box", "Discrete", "MultiBinary", "MultiDiscrete")
+_UNBOUNDED = (-np.inf, np.inf)
 
-
-# -- writing ---------------------------------------------------------------------------------------
+__all__ = ["find_oddities", "open_episodes", "open_raw", "read_metadata", "write_episodes"]
 
 
 def write_episodes(
@@ -61,6 +62,7 @@ def write_episodes(
     *,
     fps: float | None = None,
     description: str = "",
+    bounds: Bounds | None = None,
 ) -> None:
     """Writes a whole data set, or none.
 
@@ -77,17 +79,20 @@ def write_episodes(
         episodes: of equal parts, shapes and dtypes, consumed one at a time.
         fps: steps per second [Hz], kept in ``metadata.json``.
         description: kept in ``metadata.json``.
+        bounds: of floating-point actions, which become their space; ``None`` for a space without.
 
     Raises:
         DataError: if the folder exists or its name is no id of Minari's, without episodes, and for
             an episode that cannot be kept: naming episode, key and row.
-        ConfigError: if ``fps`` is not positive.
+        ConfigError: if ``fps`` is not positive, and for bounds that are none.
         MissingExtraError: if minari is not installed.
     """
     path = Path(path)
     dataset_id = _dataset_id(path)
     if fps is not None:
         check_fps(fps)
+    if bounds is not None:
+        bounds = check_bounds(bounds)
     with needs("data"):
         from minari import __version__ as version
         from minari.dataset.minari_storage import MinariStorage
@@ -96,18 +101,20 @@ def write_episodes(
         first = next(remaining, None)
         if first is None:
             raise DataError(path, None, "no episodes; valid: at least one")
-        check_episode(path, "episode_0", first, bounds=None)
+        check_episode(path, "episode_0", first, bounds=bounds)
         layout = layout_of(first)
         # Not create_dataset_from_buffers: that writes to the user's own data sets, and JPEG.
         # An absolute path: Minari joins a relative one with itself.
         storage = MinariStorage.new(
-            folder.absolute() / "data", **_spaces(_arrays(path, "episode_0", first))
+            folder.absolute() / "data", **_spaces(_arrays(path, "episode_0", first), bounds)
         )
         lengths = []
-        # Newer structures of HDF5 than its default: theirs have checksums.
-        with h5py.File(folder / "data" / "main_data.hdf5", "w", libver="latest") as file:
+        # HDF5's default structures have no checksums, these have; "latest" could only be read by
+        # the very version that wrote it.
+        libver = ("v110", "v110")
+        with h5py.File(folder / "data" / "main_data.hdf5", "w", libver=libver) as file:
             for i, episode in enumerate(chain([first], remaining)):
-                check_episode(path, f"episode_{i}", episode, layout=layout, bounds=None)
+                check_episode(path, f"episode_{i}", episode, layout=layout, bounds=bounds)
                 for key in sorted(set(first.extras) ^ set(episode.extras)):
                     message = "missing; valid: the same extras in all episodes"
                     raise DataError(path, f"episode_{i}/{key}", message)
@@ -166,24 +173,25 @@ def _arrays(path: Path, name: str, episode: Episode) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _spaces(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def _spaces(arrays: Mapping[str, np.ndarray], bounds: Bounds | None) -> dict[str, Any]:
     with needs("data"):
         from gymnasium.spaces import Dict
 
     prefix = "observations/"
     # Pairs, because gymnasium sorts a mapping, and the parts are to come back in their order.
     parts = [(key[len(prefix) :], _box(x)) for key, x in arrays.items() if key.startswith(prefix)]
-    return {"observation_space": Dict(parts), "action_space": _box(arrays["actions"])}
+    return {"observation_space": Dict(parts), "action_space": _box(arrays["actions"], bounds)}
 
 
-def _box(array: np.ndarray) -> Any:
-    """Contains whatever the dtype can hold."""
+def _box(array: np.ndarray, bounds: Bounds | None = None) -> Any:
+    """Contains whatever the dtype can hold or, of floating-point numbers, what the bounds do."""
     with needs("data"):
         from gymnasium.spaces import Box
 
     dtype, shape = array.dtype, array.shape[1:]
     if dtype.kind == "f":
-        return Box(-np.inf, np.inf, shape, dtype.type)
+        ends = [np.broadcast_to(end, shape).astype(dtype) for end in bounds or _UNBOUNDED]
+        return Box(ends[0], ends[1], shape, dtype.type)
     low, high = (0, 1) if dtype.kind == "b" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
     # Neither uint8, which can mean JPEG, nor the dtypes that TorchRL's reader does not know.
     return Box(low, high, shape, np.int32 if np.can_cast(dtype, np.int32) else np.int64)
@@ -195,171 +203,17 @@ def _write_episode(path: Path, group: h5py.Group, number: int, episode: Episode)
         parent, _, leaf = key.rpartition("/")
         # Not by its whole key: a group made on the way carries the time of day.
         where = group.require_group(parent) if parent else group
-        # Resizable, as Minari's own are.
+        # Resizable, as Minari's own are. The checksum of zeros is zero: a hole in a file would pass
+        # for data, but not for compressed ones.
+        filters = {"compression": "gzip", "compression_opts": 1, "fletcher32": True}
         shape = (None, *array.shape[1:])
-        where.create_dataset(leaf, data=array, chunks=True, maxshape=shape, fletcher32=True)
+        where.create_dataset(leaf, data=array, chunks=True, maxshape=shape, **filters)
     for key, value in episode.attributes.items():
         message = f"{type(value).__name__}; valid: numbers, strings and lists of strings"
         try:
-            if key in _OWN_ATTRIBUTES:
+            if key in OWN_ATTRIBUTES:
                 raise ValueError("a name of Minari's own")
             write_attributes(group, {key: value})
         except DAMAGE as error:
             raise DataError(path, f"{name}, attribute {key!r}", f"{message} ({error})") from error
     group.attrs.update({"id": number, "total_steps": len(episode)})
-
-
-# -- reading ---------------------------------------------------------------------------------------
-
-
-@contextmanager
-def open_episodes(path: str | os.PathLike[str]) -> Iterator[Mapping[str, Episode]]:
-    """Opens a data set, written here or by Minari; an episode is read when it is asked for.
-
-    Observations without names are read as the part ``observation``. Where neither flag is set at
-    the end, the episode was cut, which is a truncation. The info ``success`` becomes the extra
-    ``successes``; every other array of numbers among the infos keeps its name and, of T + 1 rows,
-    loses the last. Nested infos and strings are left out.
-
-    Args:
-        path: the data set's folder, which holds ``data/main_data.hdf5`` and ``data/metadata.json``.
-
-    Yields:
-        the episodes as ``episode_0``, ``episode_1``, ...; to be read inside the block.
-
-    Raises:
-        DataError: naming file and key, for a file that is missing, damaged or a git-LFS pointer, a
-            missing key, a wrong number of rows, a space of tuples or text, or an end inside an
-            episode. What concerns one episode is raised when that is read.
-    """
-    folder = Path(path) / "data"
-    is_jpeg, count = _read_metadata(folder / "metadata.json")
-    hdf5 = folder / "main_data.hdf5"
-    with open_file(hdf5) as file:
-        names = [f"episode_{i}" for i in range(count)]
-        if read_names(hdf5, file, "/") != names:
-            message = f"valid: episode_0 to {names[-1]}, as metadata.json announces"
-            raise DataError(hdf5, None, message)
-
-        def read(name: str) -> Episode:
-            return _read_episode(hdf5, file, name, is_jpeg)
-
-        yield LazyEpisodes(names, read)
-
-
-def read_metadata(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What ``metadata.json`` says of a data set that :func:`open_episodes` opens."""
-    return json.loads((Path(path) / "data" / "metadata.json").read_bytes())
-
-
-def _read_metadata(path: Path) -> tuple[dict[str, bool], int]:
-    """Keys of the observed parts below an episode, whether each is JPEG, and how many episodes."""
-    try:
-        content = path.read_bytes()
-        if content.startswith(b"version https://git-lfs"):
-            raise DataError(
-                path, None, "a git-LFS pointer, not the data; `git lfs pull` fetches them"
-            )
-        metadata = json.loads(content)
-        count, data_format = metadata["total_episodes"], metadata.get("data_format", "hdf5")
-        spaces = {"observations": json.loads(metadata["observation_space"])}
-        if spaces["observations"]["type"] == "Dict":
-            parts = spaces.pop("observations")["subspaces"]
-            spaces = {f"observations/{part}": space for part, space in parts.items()}
-        is_jpeg = {key: _is_jpeg(space) for key, space in spaces.items()}
-        spaces["actions"] = json.loads(metadata["action_space"])
-        types = {key: space["type"] for key, space in spaces.items()}
-    except DataError:
-        raise
-    except KeyError as error:
-        raise DataError(path, str(error.args[0]), "missing") from error
-    except OSError as error:
-        raise DataError(path, None, f"unreadable ({error.strerror})") from error
-    except (TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise DataError(path, None, f"not Minari's metadata ({error})") from error
-    if data_format != "hdf5":
-        raise DataError(path, "data_format", f"{data_format!r}; valid: 'hdf5'")
-    if type(count) is not int or count < 1:
-        raise DataError(path, "total_episodes", f"{count!r}; valid: 1 and more")
-    for key, kind in types.items():
-        if kind not in _SPACES:
-            raise DataError(path, key, f"a space of type {kind}; valid: {', '.join(_SPACES)}")
-    return is_jpeg, count
-
-
-def _is_jpeg(space: Mapping[str, Any]) -> bool:
-    """Minari's own rule for what it compresses."""
-    shape = space.get("shape", ())
-    if space.get("dtype") != "uint8" or len(shape) not in (2, 3) or min(shape[:2]) < 32:
-        return False
-    return bool(np.all(np.equal(space["low"], 0)) and np.all(np.equal(space["high"], 255)))
-
-
-def _read_episode(path: Path, file: h5py.File, name: str, is_jpeg: Mapping[str, bool]) -> Episode:
-    actions = read_array(path, file, f"{name}/actions")
-    if not actions.ndim or not len(actions):
-        raise DataError(path, f"{name}/actions", f"shape {actions.shape}; valid: at least one row")
-    steps = len(actions)
-    whole = {}
-    for key, jpeg in is_jpeg.items():
-        read = _read_jpeg if jpeg else read_array
-        part = key.partition("/")[2] or "observation"
-        key = f"{name}/{key}"
-        whole[part] = _check_rows(path, key, read(path, file, key), steps + 1)
-    ends = {}
-    for flag in ("terminations", "truncations"):
-        key = f"{name}/{flag}"
-        ends[flag] = _check_rows(path, key, read_array(path, file, key), steps).astype(bool)
-        for row in np.flatnonzero(ends[flag][:-1]):
-            raise DataError(path, key, f"set in row {row} of {steps}; valid: in the last only")
-    key = f"{name}/rewards"
-    attributes = read_attributes(path, file, name)
-    return Episode(
-        observations={part: array[:-1] for part, array in whole.items()},
-        next_observations={part: array[1:] for part, array in whole.items()},
-        actions=actions,
-        rewards=_check_rows(path, key, read_array(path, file, key), steps),
-        terminated=ends["terminations"],
-        extras=_read_extras(path, file, name, steps),
-        attributes={key: x for key, x in attributes.items() if key not in _OWN_ATTRIBUTES},
-    )
-
-
-def _read_extras(path: Path, file: h5py.File, name: str, steps: int) -> dict[str, np.ndarray]:
-    infos = f"{name}/infos"
-    extras = {}
-    for info in read_names(path, file, infos) if "infos" in read_names(path, file, name) else ():
-        key = f"{infos}/{info}"
-        if not _is_numbers(path, file, key):
-            continue
-        array = _check_rows(path, key, read_array(path, file, key), steps, steps + 1)
-        extras["successes" if info == "success" else info] = (
-            array[-steps:] if info == "success" else array[:steps]
-        )
-    return extras
-
-
-def _is_numbers(path: Path, file: h5py.File, key: str) -> bool:
-    try:
-        node = file[key]
-        return isinstance(node, h5py.Dataset) and node.dtype.kind in "biuf"
-    except DAMAGE as error:
-        raise DataError(path, key, f"unreadable ({error})") from error
-
-
-def _check_rows(path: Path, key: str, array: np.ndarray, *counts: int) -> np.ndarray:
-    if array.ndim == 0 or len(array) not in counts:
-        valid = " or ".join(map(str, counts))
-        raise DataError(path, key, f"shape {array.shape}; valid: {valid} rows")
-    return array
-
-
-def _read_jpeg(path: Path, file: h5py.File, key: str) -> np.ndarray:
-    with needs("data"):
-        from PIL import Image
-
-    try:
-        images = [Image.open(io.BytesIO(row.tobytes())) for row in file[key][()]]
-        return np.stack([np.asarray(image) for image in images])
-    except (*DAMAGE, SyntaxError) as error:
-        raise DataError(path, key, f"missing or no JPEG ({error})") from error

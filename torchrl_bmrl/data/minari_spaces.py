@@ -1,0 +1,220 @@
+"""Spaces of the arrays of a Minari data set, and rows that are of them or refused."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_bmrl.data.hdf5 import DAMAGE, read_array, read_node
+from torchrl_bmrl.data.schema import FLOAT32
+from torchrl_bmrl.errors import BMRLError, DataError
+
+_SPACES = ("Box", "Discrete", "MultiBinary", "MultiDiscrete")
+_JPEG = b"\xff\xd8\xff"
+"""First bytes of every JPEG."""
+
+
+@dataclass(frozen=True)
+class Space:
+    """Rows of one array: shape, dtype, and lowest and highest number."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    low: np.ndarray
+    high: np.ndarray
+
+    @classmethod
+    def of(cls, told: Mapping[str, Any]) -> Space:
+        """A space as Minari writes it into ``metadata.json``."""
+        kind = told["type"]
+        dtype = np.dtype(told.get("dtype", "int8" if kind == "MultiBinary" else "int64"))
+        start = np.asarray(told.get("start", 0))
+        if kind == "Box":
+            shape = tuple(told["shape"])
+            low, high = (np.asarray(told[end], dtype=dtype) for end in ("low", "high"))
+        elif kind == "Discrete":
+            shape, low, high = (), start, start + told["n"] - 1
+        elif kind == "MultiDiscrete":
+            counts = np.asarray(told["nvec"])
+            shape, low, high = counts.shape, start, start + counts - 1
+        else:
+            shape = tuple(np.atleast_1d(told["n"]).tolist())
+            low, high = np.asarray(0), np.asarray(1)
+        return cls(shape, dtype, np.broadcast_to(low, shape), np.broadcast_to(high, shape))
+
+    @property
+    def bounds(self) -> dict[str, Any] | None:
+        """Of a finite box of floating-point numbers, for actions; ``None`` of any other space."""
+        whole = (
+            self.dtype.kind == "f" and len(self.shape) < 2 and bool(np.all(self.low < self.high))
+        )
+        # What is as large as float32 goes has no bound in fact.
+        if not whole or np.any(np.abs([self.low, self.high]) >= FLOAT32):
+            return None
+        return {"low": _shortest(self.low), "high": _shortest(self.high)}
+
+
+def _shortest(bound: np.ndarray) -> float | list[float]:
+    return float(bound.flat[0]) if np.all(bound == bound.flat[0]) else bound.tolist()
+
+
+@dataclass(frozen=True)
+class Spaces:
+    """What ``metadata.json`` says of the arrays, by their keys below an episode."""
+
+    parts: dict[str, Space]
+    actions: Space
+    metadata: dict[str, Any]
+
+
+def read_spaces(path: str | os.PathLike[str]) -> Spaces:
+    """Reads ``metadata.json``.
+
+    Raises:
+        DataError: naming file and key, if it is missing, damaged, a git-LFS pointer, of another
+            storage than HDF5, or has no space of numbers.
+    """
+    file = metadata_file(path)
+    try:
+        content = file.read_bytes()
+        if content.startswith(b"version https://git-lfs"):
+            raise DataError(
+                file, None, "a git-LFS pointer, not the data; `git lfs pull` fetches them"
+            )
+        metadata = json.loads(content)
+        data_format = metadata.get("data_format", "hdf5")
+        told = {"observations": json.loads(metadata["observation_space"])}
+        if told["observations"]["type"] == "Dict":
+            parts = told.pop("observations")["subspaces"]
+            told = {f"observations/{part}": space for part, space in parts.items()}
+        actions = json.loads(metadata["action_space"])
+        # What is no array stays where it is, as long as something is left to see.
+        known = {key: space for key, space in told.items() if space["type"] in _SPACES}
+        for key, space in {**(told if not known else {}), "actions": actions}.items():
+            if space["type"] not in _SPACES:
+                message = f"a space of type {space['type']}; valid: {', '.join(_SPACES)}"
+                raise DataError(file, key, message)
+        spaces = {key: Space.of(space) for key, space in known.items()}
+        read = Spaces(spaces, Space.of(actions), metadata)
+    except DataError:
+        raise
+    except KeyError as error:
+        raise DataError(file, str(error.args[0]), "missing") from error
+    except OSError as error:
+        raise DataError(file, None, f"unreadable ({error.strerror})") from error
+    except (TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
+        raise DataError(file, None, f"not Minari's metadata ({error})") from error
+    if data_format != "hdf5":
+        raise DataError(file, "data_format", f"{data_format!r}; valid: 'hdf5'")
+    if not spaces:
+        raise DataError(file, "observation_space", "no part; valid: at least one")
+    return read
+
+
+def metadata_file(path: str | os.PathLike[str]) -> Path:
+    """Where a data set's folder has its metadata."""
+    return Path(path) / "data" / "metadata.json"
+
+
+def main_file(path: str | os.PathLike[str]) -> Path:
+    """Where a data set's folder has its arrays."""
+    return Path(path) / "data" / "main_data.hdf5"
+
+
+def read_rows(
+    path: Path, file: h5py.File, key: str, space: Space, *, exact: bool = False
+) -> np.ndarray:
+    """The rows of an array of a space.
+
+    Args:
+        path: of the file, for messages.
+        file: open for reading.
+        key: of the array.
+        space: of each row.
+        exact: whether integers where the space has floating-point numbers are refused, too.
+
+    Raises:
+        DataError: for rows of another shape or kind.
+    """
+    node = read_node(path, file, key)
+    if isinstance(node, h5py.Dataset) and is_jpeg(node):
+        # Bytes that were meant as bytes have their space's shape as they are.
+        meant = node.shape[1:] == space.shape
+        if not meant or _shape(next(_open_images(path, key, node))) == _drop_ones(space.shape):
+            return _decode(path, key, node, space)
+    array = read_array(path, file, key)
+    if array.ndim and array.shape[1:] != space.shape:
+        valid = ", ".join(map(str, ("T", *space.shape)))
+        raise DataError(path, key, f"shape {array.shape}; valid: ({valid}), as metadata.json says")
+    floats = array.dtype.kind == "f", space.dtype.kind == "f"
+    if floats[0] != floats[1] and (exact or floats[0]):
+        message = f"dtype {array.dtype}; valid: {space.dtype}, as metadata.json says"
+        raise DataError(path, key, message)
+    return array
+
+
+def is_jpeg(node: Any) -> bool:
+    """Whether the rows of a dataset are JPEG: bytes of one length, or of any."""
+    if not isinstance(node, h5py.Dataset) or not node.size:
+        return False
+    if node.ndim == 1:
+        kept_as_bytes = h5py.check_vlen_dtype(node.dtype) == np.uint8
+    else:
+        kept_as_bytes = node.ndim == 2 and node.dtype == np.uint8
+    if not kept_as_bytes:
+        return False
+    try:
+        return np.asarray(node[0]).tobytes().startswith(_JPEG)
+    except DAMAGE:
+        return False  # whoever reads it says what is wrong
+
+
+def _decode(path: Path, key: str, node: h5py.Dataset, space: Space) -> np.ndarray:
+    images = []
+    for i, image in enumerate(_open_images(path, key, node)):
+        # Before anything is decoded, which may take much memory.
+        if _shape(image) != _drop_ones(space.shape):
+            message = f"JPEG of shape {_shape(image)} in row {i}; valid: {space.shape}"
+            raise DataError(path, key, f"{message}, as metadata.json says")
+        try:
+            images.append(np.asarray(image).reshape(space.shape))
+        except (*DAMAGE, SyntaxError) as error:
+            raise DataError(path, key, f"no JPEG in row {i} ({error})") from error
+    return np.stack(images)
+
+
+def _open_images(path: Path, key: str, node: h5py.Dataset) -> Iterator[Any]:
+    try:
+        with needs("data"):
+        from PIL import Image
+    except ImportError as error:
+        message = f"{key} is JPEG, and there is no Pillow ({error}); valid: pip install pillow"
+        raise BMRLError(message) from error
+    try:
+        rows = node[()]
+    except DAMAGE as error:
+        raise DataError(path, key, f"unreadable ({error})") from error
+    for i, row in enumerate(rows):
+        try:
+            image = Image.open(io.BytesIO(row.tobytes()))
+        except (*DAMAGE, SyntaxError, Image.DecompressionBombError) as error:
+            raise DataError(path, key, f"no JPEG in row {i} ({error})") from error
+        yield image
+
+
+def _shape(image: Any) -> tuple[int, ...]:
+    return _drop_ones((image.height, image.width, len(image.getbands())))
+
+
+def _drop_ones(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """A shape without last dimensions of 1, which an image does not tell from none."""
+    while shape[-1:] == (1,):
+        shape = shape[:-1]
+    return shape
