@@ -100,6 +100,7 @@ def minari(folder: Path) -> Path:
         "observation_space": Dict({"x": Box(-np.inf, np.inf, (3,), np.float64)}),
         "action_space": Box(-1, 1, (2,), np.float64),
     }
+    (path / "data").mkdir(parents=True)
     storage = MinariStorage.new(path.absolute() / "data", **spaces)
     with h5py.File(path / "data" / "main_data.hdf5", "w") as file:
         for i in range(EPISODES):
@@ -175,16 +176,20 @@ def test_a_file_of_each_layout_goes_to_each_format_and_back_or_the_loss_is_named
     target.parent.mkdir()
     done = convert(source, target, to=to, fps=20, **options)
     back = tmp_path / "back.hdf5"
-    further = {"last_step": "truncate"} if to == "lerobot" else {}
+    further: dict[str, Any] = {}
+    if to == "lerobot":  # which has no place for terminations either, but for dones
+        further = {key: options[key] for key in options if key == "dones_terminate"}
+        further = further or {"last_step": "truncate"}
     convert(target, back, to="robomimic", **further)
     data = load(back)
+    part = "observation" if layout == "D4RL" else "x"
     for i in range(EPISODES):
         rows, (x, actions) = slice(i * STEPS, (i + 1) * STEPS), numbers(i)
-        np.testing.assert_array_equal(data["x"][rows], x[:-1])
+        np.testing.assert_array_equal(data[part][rows], x[:-1])
         np.testing.assert_array_equal(data["action"][rows], actions)
-        np.testing.assert_array_equal(data["next", "x"][rows][:-1], x[1:-1])
+        np.testing.assert_array_equal(data["next", part][rows][:-1], x[1:-1])
         known = layout in KNOWS_THE_LAST and to != "lerobot"
-        np.testing.assert_array_equal(data["next", "x"][rows][-1], x[-1] if known else x[-2])
+        np.testing.assert_array_equal(data["next", part][rows][-1], x[-1] if known else x[-2])
     np.testing.assert_array_equal(data["next", "reward"].squeeze(-1), np.tile(1.0 * LAST, EPISODES))
     ends = np.tile(LAST, EPISODES)
     terminates = options.get("dones_terminate", False)
@@ -197,6 +202,7 @@ def test_a_file_of_each_layout_goes_to_each_format_and_back_or_the_loss_is_named
         assert "left alone in the episodes: initial_state (3x), states (3x)" in notes
     if layout == "LIBERO" and to == "lerobot":
         assert "robot_states" in notes
+        assert "terminations" in notes
 
 
 def test_dtypes_survive_where_the_format_has_them(tmp_path: Path) -> None:

@@ -250,9 +250,8 @@ def test_every_step_reward_and_success_of_an_odd_file_is_accounted_for_or_it_is_
         data = replay[:]
         assert len(data) == truth["read"][0], where
         assert float(data["next", "reward"].sum()) == pytest.approx(truth["read"][1], abs=1e-4)
-        for name in data.keys():  # ready for use, constant dimensions among them
-            scale = replay.metadata["statistics"].get(name, {"scale": [1]})["scale"]
-            assert min(scale) > 0, where
+        # Ready for use, constant dimensions among them.
+        assert all(min(part["scale"]) > 0 for part in replay.metadata["statistics"].values()), where
         outcomes["read"] += 1
     assert not (tmp_path / "refused").exists() or not any((tmp_path / "refused").iterdir())
     assert min(outcomes.values()) > FILES / 5, outcomes

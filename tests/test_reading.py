@@ -1,4 +1,4 @@
-"""What files lack, and what is read all the same: every step, reward and success is accounted for."""
+"""What files lack and what is read all the same, with every step, reward and success accounted."""
 
 from __future__ import annotations
 
@@ -229,7 +229,7 @@ def test_isaac_labs_files_get_their_reward_from_the_attribute_success(
     tmp_path: Path, capsys: Any
 ) -> None:
     path = write(tmp_path / "a.hdf5", isaac)
-    with pytest.raises(DataError, match="data/demo_0/rewards: missing; .* 'success' or 'last'"):
+    with pytest.raises(DataError, match=r"demo_0/rewards: missing; .* 'success' or 'last'"):
         load(path)
     data = load(path, reward="success", last_step="terminate")[:]
     assert data["next", "reward"].squeeze(-1).nonzero().squeeze(-1).tolist() == [19, 59, 79]

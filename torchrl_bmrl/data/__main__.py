@@ -169,6 +169,9 @@ def reading_options() -> argparse.ArgumentParser:
         help="of actions, or `data` for their range; else what the source states, or -1 1",
     )
     group.add_argument(
+        "--horizon", type=int, help="steps of the longest episode (D4RL's files without timeouts)"
+    )
+    group.add_argument(
         "--task", choices=TASKS, help="the task in whose scene a robosuite demo.hdf5 was recorded"
     )
     group.add_argument(

@@ -7,12 +7,15 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from torchrl_bmrl.data.hdf5 import read_array, read_names, read_node
 from torchrl_bmrl.data.robomimic import STEP_KEYS
 from torchrl_bmrl.errors import ConfigError, DataError
+from torchrl_bmrl.extras import needs
+
+with needs("data"):
+    import h5py
 
 ARRAYS = ("actions", "rewards", "terminals", "timeouts")
 BEFORE, AFTER = "observations", "next_observations"

@@ -1,4 +1,4 @@
-"""Data sets in LeRobot's v3.0 layout, for training with LeRobot: written only.
+"""Data sets in LeRobot's v3.0 layout, for training with LeRobot, and from it.
 
 Layout of a data set's folder::
 
@@ -9,14 +9,15 @@ Layout of a data set's folder::
     meta/episodes/chunk-000/file-000.parquet   a row for each episode, its statistics among them
 
 The layout has no row for the observation after the last step, and everything but indices and flags
-is float32: what is written does not come back whole. Minari's layout keeps it.
+is float32: what is written does not come back whole. Minari's layout keeps it. Reading is in
+:mod:`torchrl_bmrl.data.lerobot_reader`.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,26 @@ def write_episodes(
             "features": features,
         }
         _write_json(folder / "meta" / "info.json", info)
+
+
+def describe_losses(
+    *, extras: Iterable[str], attributes: Iterable[str], rounded: bool, terminated: bool
+) -> Iterator[str]:
+    """What :func:`write_episodes` has no place for, in words.
+
+    Args:
+        extras: names of the episodes' extras.
+        attributes: names of their attributes.
+        rounded: whether some numbers have more than 32 bits.
+        terminated: whether some episodes terminate.
+    """
+    dropped = [*(name for name in extras if name != "successes"), *attributes]
+    named = f"; {', '.join(dropped)}" if dropped else ""
+    yield f"left out: the observation after the last step of each episode{named}"
+    if rounded:
+        yield "numbers of 64 bits are rounded to float32"
+    if terminated:
+        yield "terminations are kept as next.done alone: read them with dones_terminate"
 
 
 def _columns(path: Path, name: str, episode: Episode) -> dict[str, np.ndarray]:

@@ -14,7 +14,11 @@ import numpy as np
 
 from torchrl_bmrl.data.hdf5 import DAMAGE, read_array, read_node
 from torchrl_bmrl.data.schema import FLOAT32
-from torchrl_bmrl.errors import BMRLError, DataError
+from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.extras import needs
+
+with needs("data"):
+    import h5py
 
 _SPACES = ("Box", "Discrete", "MultiBinary", "MultiDiscrete")
 _JPEG = b"\xff\xd8\xff"
@@ -191,12 +195,8 @@ def _decode(path: Path, key: str, node: h5py.Dataset, space: Space) -> np.ndarra
 
 
 def _open_images(path: Path, key: str, node: h5py.Dataset) -> Iterator[Any]:
-    try:
-        with needs("data"):
+    with needs("data"):
         from PIL import Image
-    except ImportError as error:
-        message = f"{key} is JPEG, and there is no Pillow ({error}); valid: pip install pillow"
-        raise BMRLError(message) from error
     try:
         rows = node[()]
     except DAMAGE as error:

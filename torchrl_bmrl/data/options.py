@@ -38,6 +38,7 @@ class ReadOptions:
         successful: leaves out the episodes that did not succeed.
         bounds: of floating-point actions, where they are not those that the file states or, if it
             states none, [-1, 1]. ``"data"``: each dimension's smallest and largest.
+        horizon: steps of the longest episode, for D4RL's files without ``timeouts``.
 
     Raises:
         ConfigError: for invalid values.
@@ -56,6 +57,7 @@ class ReadOptions:
     reward: Reward | None = None
     successful: bool = False
     bounds: Bounds | Literal["data"] | None = None
+    horizon: int | None = None
 
     def __post_init__(self) -> None:
         keys = self.observation_keys

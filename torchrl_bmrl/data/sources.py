@@ -132,13 +132,15 @@ def open_source(
         raise ConfigError(f"task and tracking are for robosuite's demo.hdf5; {path} is {form}'s")
     if chosen.split is not None and form != "robomimic":
         raise ConfigError(f"split is {chosen.split!r}, but {path} is {form}'s, which has no masks")
+    if chosen.horizon is not None and form != "d4rl":
+        raise ConfigError(f"horizon is for D4RL's files; {path} is {form}'s")
     with ExitStack() as stack:
         if form == "robomimic":
             opened = _open_robomimic(stack, path, chosen, to_train)
         elif form == "robosuite":
             opened = _open_robosuite(stack, path, task, tracking)
         else:
-            opened = _open_other(stack, path, form)
+            opened = _open_other(stack, path, form, chosen)
         yield _apply(path, form, opened, chosen)
 
 
@@ -228,9 +230,10 @@ def _open_robomimic(stack: ExitStack, path: Path, options: ReadOptions, to_train
     )
 
 
-def _open_other(stack: ExitStack, path: Path, form: str) -> _Opened:
+def _open_other(stack: ExitStack, path: Path, form: str, options: ReadOptions) -> _Opened:
     reader: Any = {"minari": minari, "d4rl": d4rl, "lerobot": lerobot_reader}[form]
-    episodes = stack.enter_context(reader.open_raw(path))
+    further = {"horizon": options.horizon} if form == "d4rl" else {}
+    episodes = stack.enter_context(reader.open_raw(path, **further))
     told = reader.read_metadata(path)
     # As gymnasium's environments are in robomimic's layout.
     env_args = {"env_name": told.get("dataset_id", path.stem), "type": 2, "env_kwargs": {}}
@@ -238,7 +241,7 @@ def _open_other(stack: ExitStack, path: Path, form: str) -> _Opened:
     return _Opened(
         episodes=episodes,
         metadata={"env_args": env_args} | {key: told[key] for key in kept if key in told},
-        oddities=reader.find_oddities(path),
+        oddities=reader.find_oddities(path, **further),
     )
 
 
