@@ -214,7 +214,7 @@ class _Frames:
             chunk, file = divmod(self.number, FILES_PER_CHUNK)
             self.path = self.folder / "data" / _FILE.format(chunk_index=chunk, file_index=file)
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self.writer = ParquetWriter(self.path, table.schema)
+            self.writer = ParquetWriter(self.path, table.schema, write_page_checksum=True)
         self.writer.write_table(table)
         return divmod(self.number, FILES_PER_CHUNK)
 
@@ -296,7 +296,7 @@ def _write_meta(meta: Path, rows: list[dict[str, Any]], task: str) -> None:
 
     path = meta / "episodes" / _FILE.format(chunk_index=0, file_index=0)
     path.parent.mkdir(parents=True)
-    write_table(pa.Table.from_pylist(rows), path)
+    write_table(pa.Table.from_pylist(rows), path, write_page_checksum=True)
     _write_json(meta / "stats.json", _total(rows))
     # The text is the index of a data frame: LeRobot reads the table with pandas.
     types = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}

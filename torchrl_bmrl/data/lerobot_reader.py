@@ -6,7 +6,9 @@ What older versions have otherwise::
     meta/episodes.jsonl                        a line for each episode
     meta/tasks.jsonl                           a line for each task
 
-Images and videos are left alone, and what is after the last step is not in the layout.
+Pages of parquet files may carry checksums, as those do that this library writes; where they do, a
+flipped bit is found. Images and videos are left alone, and what is after the last step is not in
+the layout.
 """
 
 from __future__ import annotations
@@ -255,7 +257,7 @@ def _opened(file: Path) -> Iterator[Any]:
         import pyarrow as pa
         from pyarrow.parquet import ParquetFile
     try:
-        with ParquetFile(file) as parquet:
+        with ParquetFile(file, page_checksum_verification=True) as parquet:
             yield parquet
     except DataError:
         raise

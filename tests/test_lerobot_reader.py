@@ -1,0 +1,368 @@
+"""LeRobot data sets of three versions, made by hand: exact numbers, or an error with its place."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pyarrow")
+pytest.importorskip("tqdm")
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from episode_files import make_episode
+
+from torchrl_bmrl.data import lerobot
+from torchrl_bmrl.data.account import Account
+from torchrl_bmrl.data.convert import open_source
+from torchrl_bmrl.data.lerobot_reader import find_oddities, open_raw, read_metadata
+from torchrl_bmrl.data.schema import find_problems
+from torchrl_bmrl.errors import DataError
+
+LENGTHS, FPS = (4, 6, 5), 10
+VERSIONS = ("v2.0", "v2.1", "v3.0")
+Columns = dict[str, Any]
+PARTS = {"goal": ((3,), np.float64), "joints": ((4,), np.float64), "opening": ((), np.float64)}
+
+
+def columns_of(i: int) -> Columns:
+    """An episode as LeRobot has it; lists for what has several numbers a row."""
+    rng, steps = np.random.default_rng(i), LENGTHS[i]
+    frames, start = np.arange(steps), sum(LENGTHS[:i])
+    return {
+        "observation.state": rng.standard_normal((steps, 3)).astype("f4").tolist(),
+        "observation.environment_state": rng.standard_normal((steps, 2)).astype("f4").tolist(),
+        "observation.images.top": [{"bytes": b"png", "path": None}] * steps,
+        "action": rng.uniform(-1, 1, (steps, 2)).astype("f4").tolist(),
+        "next.reward": rng.random(steps).astype("f4"),
+        "next.done": frames == steps - 1,
+        "next.success": (frames == steps - 1) & (i != 1),
+        "effort": rng.standard_normal((steps, 2, 2)).tolist(),
+        "timestamp": (frames / FPS).astype("f4"),
+        "frame_index": frames,
+        "episode_index": np.full(steps, i),
+        "index": start + frames,
+        "task_index": np.full(steps, i % 2),
+    }
+
+
+def write(path: Path, version: str, episodes: list[Columns] | None = None) -> Path:
+    """A data set of that version; the new one has the last episode in a second file."""
+    episodes = [columns_of(i) for i in range(len(LENGTHS))] if episodes is None else episodes
+    meta = path / "meta"
+    meta.mkdir(parents=True)
+    info = {
+        "codebase_version": version,
+        "fps": FPS,
+        "total_episodes": len(episodes),
+        "total_frames": sum(len(columns["index"]) for columns in episodes),
+        "chunks_size": 2,
+        "features": {
+            "observation.state": {"dtype": "float32", "shape": [3], "names": {"axes": ["x"]}},
+            "observation.images.top": {"dtype": "image", "shape": [8, 8, 3], "names": None},
+            "observation.images.wrist": {"dtype": "video", "shape": [8, 8, 3], "names": None},
+        },
+    }
+    (meta / "info.json").write_text(json.dumps(info))
+    rows, start = [], 0
+    for i, columns in enumerate(episodes):
+        steps = len(columns["index"])
+        rows.append({"episode_index": i, "tasks": [f"task {i % 2}"], "length": steps})
+        last = i == len(episodes) - 1
+        rows[-1] |= {"data/chunk_index": 0, "data/file_index": int(last)}
+        rows[-1] |= {"dataset_from_index": start, "dataset_to_index": start + steps}
+        start += steps
+    if version == "v3.0":
+        for name, part in (("000", episodes[:-1]), ("001", episodes[-1:])):
+            tables = [pa.table(columns) for columns in part]
+            put(path / f"data/chunk-000/file-{name}.parquet", pa.concat_tables(tables))
+        put(meta / "episodes/chunk-000/file-000.parquet", pa.Table.from_pylist(rows))
+    else:
+        for i, columns in enumerate(episodes):
+            name = f"data/chunk-{i // 2:03d}/episode_{i:06d}.parquet"
+            put(path / name, pa.table(columns))
+        lines = [{key: row[key] for key in ("episode_index", "tasks", "length")} for row in rows]
+        (meta / "episodes.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return path
+
+
+def put(path: Path, table: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(table, path, row_group_size=3, write_page_checksum=True)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_every_number_is_the_file_s(tmp_path: Path, version: str) -> None:
+    with open_raw(write(tmp_path / "set", version)) as episodes:
+        assert list(episodes) == ["episode_0", "episode_1", "episode_2"]
+        for i in (2, 0, 1):
+            raw, made = episodes[f"episode_{i}"], columns_of(i)
+            assert list(raw.observations) == ["state", "environment_state"]
+            for part, array in raw.observations.items():
+                np.testing.assert_array_equal(array, np.float32(made[f"observation.{part}"]))
+            np.testing.assert_array_equal(raw.actions, np.float32(made["action"]))
+            np.testing.assert_array_equal(raw.rewards, made["next.reward"])
+            np.testing.assert_array_equal(raw.dones, made["next.done"])
+            np.testing.assert_array_equal(raw.extras["successes"], made["next.success"])
+            np.testing.assert_array_equal(raw.extras["effort"], made["effort"])
+            assert set(raw.extras) == {"successes", "effort"}
+            assert raw.attributes == {"task": f"task {i % 2}"}
+            assert raw.left_alone == ("observation.images.top",)
+            assert raw.next_observations is None
+            assert raw.succeeded == (i != 1)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_what_a_set_says_of_itself_is_read_and_contradictions_are_named(
+    tmp_path: Path, version: str
+) -> None:
+    path = write(tmp_path / "set", version)
+    assert read_metadata(path) == {"dataset_id": "set", "fps": FPS}  # of several tasks: no task
+    pictures = "left alone, as pictures: observation.images.top, observation.images.wrist"
+    assert find_oddities(path) == [pictures]
+    info = json.loads((path / "meta/info.json").read_text())
+    (path / "meta/info.json").write_text(json.dumps(info | {"total_frames": 16}))
+    assert "total_frames says 16, there are 15" in find_oddities(path)[0]
+
+
+def test_what_was_written_here_comes_back_in_its_parts(tmp_path: Path) -> None:
+    made = [make_episode(i, 5 + i, parts=PARTS) for i in range(3)]
+    lerobot.write_episodes(tmp_path / "le", made, fps=20, task="lift")
+    assert read_metadata(tmp_path / "le")["task"] == "lift"
+    with open_source(tmp_path / "le", last_step="truncate") as source:
+        for episode, original in zip(source.episodes.values(), made, strict=True):
+            assert list(episode.observations) == list(original.observations)
+            for part, array in original.observations.items():
+                np.testing.assert_array_equal(
+                    episode.observations[part], array.astype("f4"), strict=True
+                )
+            np.testing.assert_array_equal(episode.actions, original.actions)
+            np.testing.assert_array_equal(episode.rewards, original.rewards.astype("f4"))
+            solved = original.extras["successes"]
+            np.testing.assert_array_equal(episode.extras["successes"], solved)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["x.0", "x.2", "y"],
+        ["x.1", "x.0", "y"],
+        ["x", "y", "z"],
+        ["left.pos", "x.0", "x.1"],
+        ["x.0", "x.1"],
+        {"axes": ["x.0", "x.1", "x.2"]},
+        None,
+    ],
+    ids=str,
+)
+def test_names_that_are_not_numbered_parts_leave_one_part(tmp_path: Path, names: Any) -> None:
+    path = write(tmp_path / "set", "v3.0")
+    info = json.loads((path / "meta/info.json").read_text())
+    info["features"]["observation.state"]["names"] = names
+    (path / "meta/info.json").write_text(json.dumps(info))
+    with open_raw(path) as episodes:
+        assert episodes["episode_0"].observations["state"].shape == (4, 3)
+
+
+# -- damage ----------------------------------------------------------------------------------------
+
+
+def edited(change: Callable[[Columns], object]) -> Callable[[Path, str], None]:
+    """Changes the columns of the second episode."""
+
+    def damage(path: Path, version: str) -> None:
+        episodes = [columns_of(i) for i in range(len(LENGTHS))]
+        change(episodes[1])
+        write(path, version, episodes)
+
+    return damage
+
+
+def set_row(key: str, row: int, value: Any) -> Callable[[Columns], object]:
+    def change(columns: Columns) -> None:
+        values = list(columns[key])
+        values[row] = value
+        columns[key] = values
+
+    return change
+
+
+FAULTS: dict[str, tuple[Callable[[Columns], object], str]] = {
+    "no action": (lambda c: c.pop("action"), "action: missing"),
+    "no index": (lambda c: c.pop("frame_index"), "frame_index: missing"),
+    "another episode": (set_row("episode_index", 2, 0), r"episode_index: 0 in row \d+; valid: 1"),
+    "swapped rows": (set_row("frame_index", 2, 3), r"frame_index: 3 in row \d+; valid: 2"),
+    "a gap": (set_row("index", 5, 99), r"index: 99 in row \d+; valid: 9"),
+    "no value": (set_row("next.reward", 3, None), r"next\.reward: no value in row \d+"),
+    "no list": (set_row("action", 1, None), r"action: no value in row \d+"),
+    "no number": (set_row("action", 1, [0.5, None]), r"action: no value in row \d+"),
+    "a long list": (set_row("action", 4, [0.0] * 3), r"action: 3 numbers in row \d+; valid: 2"),
+    "no flag": (
+        lambda c: c.update({"next.done": [0, 0, 2, 0, 0, 1]}),
+        r"next\.done: 2 in row \d+; valid: 0 or 1",
+    ),
+    "pairs of rewards": (
+        lambda c: c.update({"next.reward": [[0.0, 1.0]] * 6}),
+        r"next\.reward: \(2,\) numbers in row \d+; valid: one",
+    ),
+    "uneven time": (set_row("timestamp", 3, 0.9), r"timestamp: .* does not fit 10 steps a second"),
+}
+
+
+ONE_SCHEMA = ("no action", "no index", "no flag", "pairs of rewards", "uneven time")
+
+
+@pytest.mark.parametrize("version", VERSIONS[1:])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_named_with_file_column_and_row(
+    tmp_path: Path, version: str, fault: str
+) -> None:
+    change, says = FAULTS[fault]
+    if version == "v3.0" and fault in ONE_SCHEMA:
+        pytest.skip("the episodes of a file have one schema")
+    edited(change)(tmp_path / "set", version)
+    with open_raw(tmp_path / "set") as episodes, pytest.raises(DataError, match=says) as caught:
+        _ = episodes["episode_1"]
+    assert caught.value.path.suffix == ".parquet"
+
+
+META: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no info": (lambda p: (p / "meta/info.json").unlink(), "no such file"),
+    "no JSON": (lambda p: (p / "meta/info.json").write_text("{"), "LeRobot's description"),
+    "a list": (lambda p: (p / "meta/info.json").write_text("[]"), "valid: a JSON object"),
+    "a pointer": (
+        lambda p: (p / "meta/info.json").write_text("version https://git-lfs.github.com"),
+        "git-LFS pointer",
+    ),
+    "another version": (
+        lambda p: (p / "meta/info.json").write_text('{"codebase_version": "v1.6"}'),
+        r"codebase_version: 'v1\.6'; valid: v2\.0, v2\.1, v3\.0",
+    ),
+    "no features": (
+        lambda p: (p / "meta/info.json").write_text('{"codebase_version": "v3.0"}'),
+        "features: missing",
+    ),
+    "no episodes": (
+        lambda p: (p / "meta/episodes/chunk-000/file-000.parquet").unlink(),
+        "no parquet file",
+    ),
+    "a damaged table": (
+        lambda p: (p / "meta/episodes/chunk-000/file-000.parquet").write_bytes(b"PAR1PAR1"),
+        "not a whole parquet file",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", META)
+def test_a_fault_of_the_description_is_named(tmp_path: Path, fault: str) -> None:
+    path = write(tmp_path / "set", "v3.0")
+    damage, says = META[fault]
+    damage(path)
+    with pytest.raises(DataError, match=says), open_raw(path):
+        pass
+
+
+def test_a_pointer_in_place_of_the_data_is_named(tmp_path: Path) -> None:
+    path = write(tmp_path / "set", "v2.1")
+    (path / "data/chunk-000/episode_000001.parquet").write_text("version https://git-lfs.g")
+    with open_raw(path) as episodes, pytest.raises(DataError, match="git lfs pull"):
+        _ = episodes["episode_1"]
+
+
+# -- hundreds of mutations -------------------------------------------------------------------------
+
+
+def mutate_bytes(path: Path, rng: np.random.Generator) -> None:
+    file = rng.choice(sorted(str(file) for file in path.rglob("*.*") if file.is_file()))
+    data = bytearray(Path(file).read_bytes())
+    kind = rng.integers(4)
+    if kind == 0:
+        del data[rng.integers(len(data)) :]
+    elif kind == 1:
+        data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
+    elif kind == 2:
+        start = int(rng.integers(len(data)))
+        data[start : start + 16] = bytes(len(data[start : start + 16]))
+    else:
+        del data[int(rng.integers(len(data))) :][:8]
+    Path(file).write_bytes(data)
+
+
+def mutate_columns(path: Path, rng: np.random.Generator) -> None:
+    files = sorted((path / "data").rglob("*.parquet"))
+    file = files[rng.integers(len(files))]
+    table = pq.read_table(file)
+    name = str(rng.choice(table.column_names))
+    kind = rng.integers(6)
+    if kind == 0:
+        table = table.drop_columns([name])
+    elif kind == 1:
+        table = table.rename_columns({name: f"{name}_"})
+    elif kind == 2:
+        table = table.slice(0, max(0, len(table) - int(rng.integers(1, 4))))
+    elif kind == 3:
+        order = rng.permutation(len(table))
+        table = table.take(pa.array(order))
+    elif kind == 4:
+        values = table[name].to_pylist()
+        values[rng.integers(len(values))] = None
+        place = table.column_names.index(name)
+        table = table.set_column(place, name, pa.array(values, table[name].type))
+    else:
+        table = table.append_column("further", pa.array(["text"] * len(table)))
+    pq.write_table(table, file)
+
+
+def mutate_meta(path: Path, rng: np.random.Generator) -> None:
+    file = path / "meta/info.json"
+    info = json.loads(file.read_text())
+    key = str(rng.choice([*info, "fps"]))
+    values = (None, -1, "", 3.5, [], {}, "v9", 10**12, True)
+    info[key] = values[rng.integers(len(values))]
+    file.write_text(json.dumps(info))
+
+
+def read_all(path: Path) -> tuple[Account, list[Any], str | None]:
+    """All episodes, without their last steps, and their account; or why they cannot be read."""
+    account, found = Account(), []
+    try:
+        with open_source(path, last_step="drop") as source:
+            for name, episode in source.episodes.items():
+                for key, message in find_problems(episode):
+                    raise DataError(path, f"{name}/{key}", message)
+                account.add(episode)
+                found.append(episode)
+    except DataError as error:
+        return account, found, str(error)
+    return account, found, None
+
+
+def test_every_mutated_set_is_refused_by_name_or_accounts_for_every_step(tmp_path: Path) -> None:
+    outcomes: Counter[str] = Counter()
+    for number in range(240):
+        rng = np.random.default_rng(number)
+        path = write(tmp_path / str(number), VERSIONS[number % 3])
+        (mutate_bytes, mutate_columns, mutate_meta)[number // 3 % 3](path, rng)
+        account, episodes, refusal = read_all(path)
+        if refusal is not None:
+            assert refusal.startswith(str(path)), refusal
+            outcomes["refused"] += 1
+            continue
+        outcomes["read"] += 1
+        # Whatever is read is what was written, and nothing of it is missing.
+        assert account.whole.steps == sum(LENGTHS)
+        assert account.cut.steps == len(LENGTHS)
+        for i, episode in enumerate(episodes):
+            made = columns_of(i)
+            np.testing.assert_array_equal(episode.actions, np.float32(made["action"])[:-1])
+            np.testing.assert_array_equal(episode.rewards, made["next.reward"][:-1])
+            for part, array in episode.observations.items():
+                expected = made.get(f"observation.{part.removesuffix('_')}")
+                np.testing.assert_array_equal(array, np.float32(expected)[:-1])
+    assert min(outcomes["read"], outcomes["refused"]) > 60, outcomes
