@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+import torchrl_bmrl.as_command  # noqa: F401 (first)
 from torchrl_bmrl.command_line import exit_codes
 from torchrl_bmrl.data.convert import TARGETS, Source, convert, open_source
 from torchrl_bmrl.data.episodes import Episode
