@@ -15,7 +15,8 @@ def _say(kind: type[BaseException], error: BaseException, trace: TracebackType |
     if isinstance(error, BMRLError):
         print(f"error: {error}", file=sys.stderr, flush=True)
     else:
-        sys.__excepthook__(kind, error, trace)
+        _before(kind, error, trace)
 
 
+_before = sys.excepthook
 sys.excepthook = _say

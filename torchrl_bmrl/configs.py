@@ -14,14 +14,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from torchrl.trainers.algorithms.configs.objectives import LossConfig
-
 from torchrl_bmrl.extras import needs
 from torchrl_bmrl.objectives.distillation import ENCODER_TERMS
 
 with needs("recipes"):
     from hydra.core.config_store import ConfigStore
     from omegaconf import MISSING
+    from torchrl.trainers.algorithms.configs.objectives import LossConfig
 
 __all__ = [
     "BCQLossConfig",

@@ -15,6 +15,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+import torchrl_bmrl.as_command  # noqa: F401 (first)
 from torchrl_bmrl.command_line import exit_codes
 from torchrl_bmrl.data.convert import TARGETS, convert
 from torchrl_bmrl.data.episodes import Episode

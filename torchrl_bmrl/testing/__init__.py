@@ -3,7 +3,10 @@
 The core does not import this package.
 """
 
-import pytest
+from torchrl_bmrl.extras import needs
+
+with needs("test"):
+    import pytest
 
 # Before they are imported: a failed check shows the values that it compared.
 pytest.register_assert_rewrite(f"{__name__}.contract", f"{__name__}.measures")
