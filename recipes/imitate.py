@@ -279,7 +279,7 @@ def imitate(config: Config) -> None:
 @hydra.main(version_base="1.3", config_path="config", config_name="recipe")
 def main(config: DictConfig) -> None:
     """Command line."""
-    run_recipe(config, imitate)
+    run_recipe(config, imitate, trains=False)
 
 
 if __name__ == "__main__":

@@ -303,7 +303,7 @@ def latent_sac(config: Config) -> None:
 @hydra.main(version_base="1.3", config_path="config", config_name="recipe")
 def main(config: DictConfig) -> None:
     """Command line."""
-    run_recipe(config, latent_sac)
+    run_recipe(config, latent_sac, trains=False)
 
 
 if __name__ == "__main__":
