@@ -1,6 +1,6 @@
 """Learning on top: SAC that chooses m, a frozen distilled policy that executes it.
 
-    python recipes/latent_sac.py preset=compose run_dir=runs/mine      # after recipes/two_stage.py
+    python recipes/latent_sac.py run_dir=runs/mine      # after recipes/two_stage.py preset=compose
     python recipes/latent_sac.py run_dir=runs/mine latent_sac.composition=lift-reach
 
 TorchRL's SAC on a composition that rewards nothing but its stages, +1 for each: once with m as its
