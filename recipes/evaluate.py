@@ -287,7 +287,7 @@ def run_facts(config: Config) -> dict[str, str]:
 @hydra.main(version_base="1.3", config_path="config", config_name="recipe")
 def main(config: DictConfig) -> None:
     """Command line."""
-    run_recipe(config, evaluate)
+    run_recipe(config, evaluate, trains=False)
 
 
 if __name__ == "__main__":

@@ -157,7 +157,7 @@ def export(config: Config) -> None:
 @hydra.main(version_base="1.3", config_path="config", config_name="recipe")
 def main(config: DictConfig) -> None:
     """Command line."""
-    run_recipe(config, export)
+    run_recipe(config, export, trains=False)
 
 
 if __name__ == "__main__":

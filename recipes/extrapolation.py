@@ -28,6 +28,7 @@ from typing import Any
 import hydra
 import torch
 from algorithms import bc, bcq, ddpg, iql, make_actor, make_critics, plas, td3_bc
+from given import with_folders_settings
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
@@ -56,9 +57,8 @@ from torchrl_bmrl.evaluation.rollout import rollout_episodes
 from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import finite, read_rows, whole, write_atomic, write_rows
 from torchrl_bmrl.health import check_metrics
-from torchrl_bmrl.locks import hold
+from torchrl_bmrl.locks import hold_run
 from torchrl_bmrl.parallel import Report, available_cores, derive_seed, run_jobs
-from torchrl_bmrl.runs import open_run
 
 with needs("robosuite"):
     import gymnasium
@@ -299,6 +299,8 @@ def check_settings(settings: Settings) -> None:
     Raises:
         BMRLError: naming the setting, its value and what is valid.
     """
+    if not settings.run_dir:
+        raise ConfigError("run_dir is ''; valid: a folder, . for the one that one is in")
     envs = [
         name
         for name, spec in gymnasium.registry.items()
@@ -334,11 +336,9 @@ ConfigStore.instance().store(name="extrapolation_schema", node=Settings)
 def main(config: DictConfig) -> None:
     """Command line."""
     with exit_codes():
-        settings = OmegaConf.to_object(config)
+        settings = OmegaConf.to_object(with_folders_settings(config))
         check_settings(settings)
-        run_dir = Path(settings.run_dir)
-        with hold(run_dir):
-            open_run(run_dir, asdict(settings))
+        with hold_run(Path(settings.run_dir), asdict(settings)):
             extrapolation(settings)
 
 

@@ -1,7 +1,7 @@
 """One-shot imitation: one demonstration of a composition drives the distilled policy.
 
-    python recipes/imitate.py preset=compose run_dir=runs/mine      # after recipes/two_stage.py
-    python recipes/imitate.py preset=compose run_dir=runs/mine imitate.composition=reach-lift
+    python recipes/imitate.py run_dir=runs/mine      # after recipes/two_stage.py preset=compose
+    python recipes/imitate.py run_dir=runs/mine imitate.composition=reach-lift
 
 From other starts and to other goals than the demonstration's, the actions executed as they are or
 perturbed: the demonstration's embeddings in several alignments, beside a policy that is told the
@@ -281,7 +281,7 @@ def imitate(config: Config) -> None:
 @hydra.main(version_base="1.3", config_path="config", config_name="recipe")
 def main(config: DictConfig) -> None:
     """Command line."""
-    run_recipe(config, imitate)
+    run_recipe(config, imitate, trains=False)
 
 
 if __name__ == "__main__":

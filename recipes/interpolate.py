@@ -351,7 +351,7 @@ def interpolate(config: Config) -> None:
 @hydra.main(version_base="1.3", config_path="config", config_name="recipe")
 def main(config: DictConfig) -> None:
     """Command line."""
-    run_recipe(config, interpolate)
+    run_recipe(config, interpolate, trains=False)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Learning on top: SAC that chooses m, a frozen distilled policy that executes it.
 
-    python recipes/latent_sac.py preset=compose run_dir=runs/mine      # after recipes/two_stage.py
+    python recipes/latent_sac.py run_dir=runs/mine      # after recipes/two_stage.py preset=compose
     python recipes/latent_sac.py run_dir=runs/mine latent_sac.composition=lift-reach
 
 TorchRL's SAC on a composition that rewards nothing but its stages, +1 for each: once with m as its
@@ -305,7 +305,7 @@ def latent_sac(config: Config) -> None:
 @hydra.main(version_base="1.3", config_path="config", config_name="recipe")
 def main(config: DictConfig) -> None:
     """Command line."""
-    run_recipe(config, latent_sac)
+    run_recipe(config, latent_sac, trains=False)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from given import with_folders_settings
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -19,7 +20,7 @@ from torchrl_bmrl.command_line import exit_codes
 from torchrl_bmrl.data.replay import check_device
 from torchrl_bmrl.errors import ConfigError, UnknownNameError
 from torchrl_bmrl.experts.controllers import ExpertGains
-from torchrl_bmrl.locks import hold
+from torchrl_bmrl.locks import hold_run
 from torchrl_bmrl.messages import say
 from torchrl_bmrl.names import STEPPERS, TASKS, check_task, composition_stages
 from torchrl_bmrl.objectives.bcq import TARGET_DTYPES
@@ -28,7 +29,7 @@ from torchrl_bmrl.objectives.common import LOSS_FUNCTIONS
 from torchrl_bmrl.objectives.distillation import CONTEXTS, ENCODER_TERMS
 from torchrl_bmrl.objectives.generative import KL_REDUCTIONS
 from torchrl_bmrl.parallel import available_cores
-from torchrl_bmrl.runs import LOGGERS, deciding, open_run
+from torchrl_bmrl.runs import LOGGERS, deciding
 
 BASELINES = ("bc", "td3_bc", "iql", "cql", "bcq_one_hot")
 
@@ -299,12 +300,18 @@ CHOICES = {
 }
 
 
-def check_settings(config: Config) -> None:
+def check_settings(config: Config, *, device: bool = True) -> None:
     """Checks what types cannot say.
+
+    Args:
+        config: the settings.
+        device: whether ``device`` must be one of this machine.
 
     Raises:
         BMRLError: naming the key, its value and what is valid.
     """
+    if not config.run_dir:
+        raise ConfigError("run_dir is ''; valid: a folder, . for the one that one is in")
     for task in [*config.tasks, *config.collect.train_episodes, config.interpolation.task]:
         check_task(task)
     missing = [task for task in config.tasks if task not in config.collect.train_episodes]
@@ -359,7 +366,8 @@ def check_settings(config: Config) -> None:
             "distill.task_encoder is one_hot, which knows no transitions; valid with it: "
             "evaluate.latent_sources=[prototype] and distill.isometry_weight=0"
         )
-    check_device(config.device)
+    if device:
+        check_device(config.device)
     check_value_bounds(config.bcq.value_bounds)
     for term in config.distill.encoder_terms:
         if term not in ENCODER_TERMS:
@@ -402,7 +410,11 @@ def tell(config: Config, message: str) -> None:
 
 
 def run_recipe(
-    settings: DictConfig, run: Callable[[Config], None], *, splits: bool = False
+    settings: DictConfig,
+    run: Callable[[Config], None],
+    *,
+    splits: bool = False,
+    trains: bool = True,
 ) -> None:
     """Runs a recipe in its run folder, which it holds meanwhile; ends as a command should.
 
@@ -410,19 +422,21 @@ def run_recipe(
         settings: what the command line and the preset say.
         run: the recipe.
         splits: it does the tasks of ``only`` and leaves the others to other jobs.
+        trains: it needs the run's ``device``, which another machine may not have.
     """
     with exit_codes(out_of_memory=OUT_OF_MEMORY):
         try:
+            composed, settings = settings, with_folders_settings(settings)
             config = OmegaConf.to_object(settings)
         except OmegaConfBaseException as error:  # a reference to nothing, say
             raise ConfigError(str(error).partition("\n")[0]) from error
-        check_settings(config)
+        check_settings(config, device=trains or settings is composed)
         if config.only is not None and not splits:
             raise ConfigError(f"only is {config.only}; valid: null, except with train_bcq.py")
         run_dir = Path(config.run_dir)
         # A job of only some tasks leaves the others', and all else, to other jobs.
-        with hold(run_dir, config.only or ["run", *config.tasks]):
-            open_run(run_dir, OmegaConf.to_container(settings, resolve=True))
+        parts = config.only or ["run", *config.tasks]
+        with hold_run(run_dir, OmegaConf.to_container(settings, resolve=True), parts):
             tell(
                 config,
                 f"{run_dir}: {run.__name__}, preset {config.preset}, seed {config.seed}, "

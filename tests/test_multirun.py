@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import importlib
+import os
 import shutil
 import signal
+import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,6 +24,7 @@ pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
 import yaml
+from hydra.core.hydra_config import HydraConfig
 from small_runs import RECIPES, configured, contents, recipe
 
 from torchrl_bmrl.errors import ConfigError, StoppedError
@@ -69,6 +74,11 @@ def test_a_job_returns_what_went_wrong_and_starts_where_the_sweep_was_started(
 
     monkeypatch.chdir(tmp_path)  # puts the folder back afterwards
     (tmp_path / "sweep").mkdir()
+    notes = tmp_path / "notes"
+    number = iter(range(4))
+    monkeypatch.setattr(
+        HydraConfig, "get", lambda: SimpleNamespace(job=SimpleNamespace(num=next(number)))
+    )
 
     def well(config: Any) -> None:
         Path("here").touch()
@@ -79,13 +89,16 @@ def test_a_job_returns_what_went_wrong_and_starts_where_the_sweep_was_started(
     def unexpected(config: Any) -> None:
         raise KeyError("robot")
 
-    assert run_job(well, str(tmp_path / "sweep"), {}) is None
+    assert run_job(well, str(tmp_path / "sweep"), str(notes), {}) is None
     assert (tmp_path / "sweep" / "here").exists()
-    assert run_job(expected, str(tmp_path), {}) == "error: seed is -1"
-    report = run_job(unexpected, str(tmp_path), {})
+    assert run_job(expected, str(tmp_path), str(notes), {}) == "error: seed is -1"
+    report = run_job(unexpected, str(tmp_path), str(notes), {})
     assert "in unexpected" in report
     assert "KeyError: 'robot'" in report
-    assert "FileNotFoundError" in run_job(well, str(tmp_path / "elsewhere"), {})
+    missing = run_job(well, str(tmp_path / "elsewhere"), str(notes), {})
+    assert "FileNotFoundError" in missing
+    kept = [(notes / str(number)).read_text() for number in range(4)]
+    assert kept == ["", "error: seed is -1", report, missing]
 
 
 @pytest.mark.parametrize("cause", [StoppedError(signal.SIGTERM), KeyboardInterrupt()])
@@ -100,8 +113,117 @@ def test_a_job_that_is_asked_to_stop_stops_the_sweep(
         raise SystemExit(143) from cause
 
     with pytest.raises(SystemExit) as end:
-        run_job(stopped, str(tmp_path), {})
+        run_job(stopped, str(tmp_path), str(tmp_path), {})
     assert end.value.code == 143
+    assert list(tmp_path.iterdir()) == []
+
+
+# -- sweeps whose jobs fail ------------------------------------------------------------------------
+
+RECIPE = f"""
+import os, signal, time
+import hydra, settings
+from torchrl_bmrl.command_line import exit_codes
+from torchrl_bmrl.errors import ConfigError
+from torchrl_bmrl.messages import say
+
+@hydra.main(version_base="1.3", config_path={str(RECIPES / "config")!r}, config_name="recipe")
+def main(config):
+    with exit_codes():
+        if config.seed == 1:
+            raise ConfigError("no seed for me")
+        if config.seed == 3:
+            raise KeyError("robot")
+        if config.seed == 5:
+            time.sleep(3)  # the others are done by then
+            os.kill(os.getpid(), signal.SIGKILL)
+        with open(f"{{config.run_dir}}-{{config.seed}}", "x"):
+            pass
+
+if __name__ == "__main__":
+    main()
+"""
+"""Fails in ways that its seed decides."""
+
+
+def sweep(cwd: Path, *overrides: str) -> tuple[int, str, set[str]]:
+    """Exit code of a sweep, what it says, and the files of the jobs that went well."""
+    (cwd / "failing.py").write_text(RECIPE)
+    path = os.pathsep.join(filter(None, [str(RECIPES), os.environ.get("PYTHONPATH")]))
+    done = subprocess.run(
+        [sys.executable, "failing.py", "--multirun", *overrides],
+        cwd=cwd,
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    (cwd / "failing.py").unlink()
+    for left in cwd.glob("runs/multirun/*/*"):
+        assert left.name == "multirun.yaml"
+    return done.returncode, done.stderr, {path.name for path in cwd.iterdir() if path.is_file()}
+
+
+LAUNCHERS = {
+    "basic": [],
+    "joblib": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
+    "ray": ["hydra/launcher=cluster", "+hydra.launcher.ray.init.num_cpus=2"],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", LAUNCHERS)
+def test_every_job_that_fails_is_named_and_the_others_are_done(
+    tmp_path: Path, launcher: str
+) -> None:
+    if launcher != "basic":
+        pytest.importorskip(f"hydra_plugins.hydra_{launcher}_launcher")
+    options = ["seed=0,1,2,3,4", "run_dir=1.10", *LAUNCHERS[launcher]]
+    code, said, files = sweep(tmp_path, *options)
+    assert code == 1
+    assert files == {"1.10-0", "1.10-2", "1.10-4"}
+    lines = said.partition("2 of 5 jobs failed, the others are done:\n")[2].splitlines()
+    assert lines[:2] == ["seed=1 run_dir='1.10'", "    error: no seed for me"]
+    assert lines[2:4] == ["seed=3 run_dir='1.10'", "    Traceback (most recent call last):"]
+    assert lines[-1] == "KeyError: 'robot'"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["joblib", "ray"])
+def test_jobs_that_failed_are_named_though_another_ones_process_was_killed(
+    tmp_path: Path, launcher: str
+) -> None:
+    pytest.importorskip(f"hydra_plugins.hydra_{launcher}_launcher")
+    options = ["seed=0,1,5", "run_dir=x", *LAUNCHERS[launcher]]
+    code, said, files = sweep(tmp_path, *options)
+    assert (code, files) == (1, {"x-0"})
+    lines = said.partition("2 of 3 jobs failed, the others are done:\n")[2].splitlines()
+    assert lines[:3] == ["seed=1 run_dir=x", "    error: no seed for me", "seed=5 run_dir=x"]
+    assert lines[3].startswith("    did not end: ")
+    assert "Traceback" not in said
+
+
+@pytest.mark.slow
+def test_jobs_that_are_not_valid_are_all_named_before_anything_is_done(tmp_path: Path) -> None:
+    options = ["bcq.lr=abc,1e-3,def", "run_dir=x", "hydra.sweeper.max_batch_size=1"]
+    code, said, _ = sweep(tmp_path, *options)
+    assert code == 1
+    assert list(tmp_path.iterdir()) == []
+    lines = said.partition("2 of 3 jobs are not valid, none was started:\n")[2].splitlines()
+    assert [line for line in lines if not line.startswith(" ")] == [
+        "bcq.lr=abc run_dir=x",
+        "bcq.lr=def run_dir=x",
+    ]
+    assert "Error merging override bcq.lr=abc; Value 'abc' of type 'str' could not be" in lines[1]
+
+
+@pytest.mark.slow
+def test_a_batch_goes_on_after_one_whose_jobs_failed(tmp_path: Path) -> None:
+    options = ["seed=1,3,2", "run_dir=x", "hydra.sweeper.max_batch_size=1"]
+    code, said, files = sweep(tmp_path, *options)
+    assert (code, files) == (1, {"x-2"})
+    assert "2 of 3 jobs failed, the others are done:\nseed=1 run_dir=x\n" in said
+    assert "\nseed=3 run_dir=x\n" in said
 
 
 # -- sweeps ----------------------------------------------------------------------------------------
@@ -162,7 +284,7 @@ def check_sweep_of_three_seeds(cwd: Path, alone: list[dict[str, bytes]], *launch
     for seed, expected in zip((0, 2), alone, strict=True):
         assert len(expected) > 3
         assert contents(cwd / "runs" / f"collect-smoke-seed{seed}", "data/**/*") == expected
-    assert {path.name for path in taken.iterdir()} == {"config.yaml", ".locks"}
+    assert [path.name for path in taken.iterdir()] == ["config.yaml"]
     assert [path.name for path in cwd.iterdir()] == ["runs"]
     assert [path.name for path in cwd.glob("runs/multirun/*/*")] == ["multirun.yaml"]
 

@@ -23,6 +23,25 @@ WINDOW = 6
 """Lines whose time the rate is taken over: what was read back at the start is soon out of it."""
 
 
+_whose = ""
+
+
+def name_lines(whose: str) -> None:
+    """Has lines, from now on, begin with a name: those of several runs may share a log.
+
+    Args:
+        whose: of what goes on in this process.
+
+    Example:
+        >>> name_lines("runs/mine")
+        >>> Lines(200, "training", "update").line(now=time.monotonic() + 10)
+        'runs/mine: training: 0 of 200 updates (0%), none in the last 0:00:10'
+        >>> name_lines("")
+    """
+    global _whose
+    _whose = f"{whose}: " if whose else ""
+
+
 class Progress(Protocol):
     """What a loop counts on, a bar or lines."""
 
@@ -116,7 +135,7 @@ class Lines:
         where += f" {self.unit}s"
         if self.total:
             where += f" ({self.n / self.total:.0%})"
-        return f"{self.description}: {where}"
+        return f"{_whose}{self.description}: {where}"
 
     def _speed(self, rate: float) -> str:
         per = "s" if rate >= 1 else "min" if rate >= 1 / 60 else "h"

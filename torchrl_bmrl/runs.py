@@ -121,7 +121,7 @@ def deciding(settings: Mapping[str, Any]) -> dict[str, Any]:
         >>> deciding({"seed": 0, "workers": 2, "bcq": {"lr": 0.001}})
         {'seed': 0, 'bcq.lr': 0.001}
     """
-    return dict(_flat({key: x for key, x in settings.items() if key not in FREE_TO_CHANGE}))
+    return dict(flat({key: x for key, x in settings.items() if key not in FREE_TO_CHANGE}))
 
 
 def _adopt(run_dir: Path, base: Path, patterns: Iterable[str]) -> None:
@@ -222,10 +222,16 @@ def _commit() -> str | None:
         return None
 
 
-def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Settings by their dotted names.
+
+    Example:
+        >>> dict(flat({"seed": 0, "bcq": {"lr": 0.001}}))
+        {'seed': 0, 'bcq.lr': 0.001}
+    """
     for key, value in settings.items():
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
+            yield from flat(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
 

@@ -6,27 +6,36 @@ import importlib
 import inspect
 import multiprocessing
 import os
+import shutil
 import sys
 import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn
+from hydra.errors import HydraException
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_bmrl.errors import StoppedError
+from torchrl_bmrl.files import write_atomic
 
 
-def run_job(main: Callable[[DictConfig], None], cwd: str, config: DictConfig) -> str | None:
+def run_job(
+    main: Callable[[DictConfig], None], cwd: str, notes: str, config: DictConfig
+) -> str | None:
     """Runs a job of a sweep, in this process or another one.
 
     Args:
         main: the recipe's, importable by name.
         cwd: what relative paths start from; processes of a cluster run elsewhere.
+        notes: folder where the job leaves what came of it, in case its launcher never says.
         config: of the job.
 
     Returns:
@@ -35,16 +44,22 @@ def run_job(main: Callable[[DictConfig], None], cwd: str, config: DictConfig) ->
     if multiprocessing.get_start_method() not in multiprocessing.get_all_start_methods():
         # joblib's: workers would be told of it at their start and not know it.
         multiprocessing.set_start_method("spawn", force=True)
+    # Needs an extra, and Hydra imports this module before a recipe can say which.
+    from torchrl_bmrl.progress import name_lines
+
+    problem = None
     try:
         os.chdir(cwd)
+        name_lines(str(config.get("run_dir", "")))
         main(config)
     except SystemExit as stop:
         if isinstance(stop.__cause__, StoppedError | KeyboardInterrupt):  # the whole sweep's
             raise
-        return f"error: {stop.__cause__ or stop}"
+        problem = f"error: {stop.__cause__ or stop}"
     except Exception:
-        return traceback.format_exc()
-    return None
+        problem = traceback.format_exc().rstrip()
+    write_atomic(Path(notes) / str(HydraConfig.get().job.num), problem or "")
+    return problem
 
 
 class ReportingSweeper(BasicSweeper):
@@ -59,16 +74,59 @@ class ReportingSweeper(BasicSweeper):
         not find them by their names.
         """
         module = importlib.import_module(Path(inspect.getfile(task_function)).stem)
-        job = partial(run_job, getattr(module, task_function.__name__), os.getcwd())
+        self.notes = Path(config.hydra.sweep.dir).absolute() / ".jobs"
+        main = getattr(module, task_function.__name__)
+        job = partial(run_job, main, os.getcwd(), str(self.notes))
         super().setup(hydra_context=hydra_context, task_function=job, config=config)
 
     def sweep(self, arguments: list[str]) -> Any:
-        """Launches the jobs; exits if any failed."""
-        batches: list[Sequence[JobReturn]] = super().sweep(arguments)
-        jobs = [job for batch in batches for job in batch]
-        failed = [job for job in jobs if job.return_value is not None]
-        if failed:
-            lines = [f"{len(failed)} of {len(jobs)} jobs failed, the others are done:"]
-            lines += [f"{' '.join(job.overrides)}\n    {job.return_value}" for job in failed]
-            sys.exit("\n".join(lines))
+        """Launches the jobs if all can be composed; exits if any failed."""
+        jobs = self.compose_all(arguments)
+        try:
+            return self.launch_all(arguments, jobs)
+        finally:
+            shutil.rmtree(self.notes, ignore_errors=True)
+
+    def compose_all(self, arguments: list[str]) -> list[list[str]]:
+        """Each job's overrides; exits, before anything is written, if some are not valid."""
+        assert self.hydra_context is not None
+        loader = self.hydra_context.config_loader
+        lines = [*self._parse_config(), *arguments]
+        overrides = OverridesParser.create(config_loader=loader).parse_overrides(lines)
+        (jobs,) = self.split_arguments(overrides, None)
+        problems = []
+        for job in jobs:
+            try:
+                loader.load_sweep_config(self.config, list(job))
+            except (HydraException, OmegaConfBaseException) as error:
+                reasons = [str(e).partition("\n")[0] for e in (error, error.__cause__) if e]
+                problems.append((job, "; ".join(reasons)))
+        if problems:
+            end(f"{len(problems)} of {len(jobs)} jobs are not valid, none was started:", problems)
+        return jobs
+
+    def validate_batch_is_legal(self, batch: Sequence[Sequence[str]]) -> None:
+        """All batches were composed before the first one was launched."""
+
+    def launch_all(self, arguments: list[str], jobs: list[list[str]]) -> Any:
+        """Launches the jobs; exits if any failed, or their launcher did."""
+        try:
+            batches: list[Sequence[JobReturn]] = super().sweep(arguments)
+            found = [job.return_value for batch in batches for job in batch]
+        except Exception as error:  # of the launcher: a process was killed, a cluster is gone
+            lost = str(error).strip().partition("\n")[0] or type(error).__name__
+            files = [self.notes / str(number) for number in range(len(jobs))]
+            found = [
+                file.read_text() or None if file.exists() else f"did not end: {lost}"
+                for file in files
+            ]
+        problems = [(job, x) for job, x in zip(jobs, found, strict=True) if x is not None]
+        if problems:
+            end(f"{len(problems)} of {len(jobs)} jobs failed, the others are done:", problems)
         return batches
+
+
+def end(summary: str, problems: list[tuple[list[str], str]]) -> NoReturn:
+    """Exits with all of a sweep's problems, each below its job's overrides."""
+    lines = [f"{' '.join(job)}\n    {problem}" for job, problem in problems]
+    sys.exit("\n".join([summary, *lines]))
