@@ -28,7 +28,7 @@ from torchrl_bmrl.checkpoint import keep_training, resume_training
 from torchrl_bmrl.data import make_multi_task_replay_buffer, with_previous
 from torchrl_bmrl.data.demonstrations import load_transitions, read_statistics
 from torchrl_bmrl.errors import StoppedError
-from torchrl_bmrl.functional import sample_action_latent
+from torchrl_bmrl.functional import nonzero_scale, sample_action_latent
 from torchrl_bmrl.health import check_metrics, check_proposals
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
@@ -72,7 +72,13 @@ def value_statistics(
         teacher.qvalue_network(data.select("observation", "action")).get("state_action_value")
         for teacher, data in zip(teachers, datasets, strict=True)
     ]
-    return torch.stack([v.mean() for v in values]), torch.stack([v.std() for v in values])
+    return torch.stack([v.mean() for v in values]), torch.stack([spread(v) for v in values])
+
+
+def spread(values: Tensor) -> Tensor:
+    """Standard deviation of a task's numbers, ``(N, 1)``; 1 where they are all the same."""
+    deviation = values.std() if len(values) > 1 else torch.zeros_like(values).sum()
+    return nonzero_scale(deviation, values.abs().max(), values.dtype)
 
 
 def train_student(config: Config, report: Report) -> None:
@@ -111,7 +117,7 @@ def train_student(config: Config, report: Report) -> None:
         teachers,
         qvalue_loc=normalisation[0],
         qvalue_scale=normalisation[1],
-        reward_scale=torch.stack([data["next", "reward"].std() for data in train]),
+        reward_scale=torch.stack([spread(data["next", "reward"]) for data in train]),
         **{name: getattr(settings, name) for name in LOSS_SETTINGS},
     ).to(config.device)
     optimizer = make_adam(loss.parameters(), lr=settings.lr)

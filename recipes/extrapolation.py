@@ -56,6 +56,7 @@ from torchrl_bmrl.errors import ConfigError, UnknownNameError
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
 from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import finite, read_rows, whole, write_atomic, write_rows
+from torchrl_bmrl.functional import nonzero_scale
 from torchrl_bmrl.health import check_metrics
 from torchrl_bmrl.locks import hold_run
 from torchrl_bmrl.parallel import Report, available_cores, derive_seed, run_jobs
@@ -179,7 +180,9 @@ def train(settings: Settings, name: str, seed: int, report: Report) -> list[floa
     """Trains an algorithm on a seed's batch alone; the returns of its policy's episodes."""
     state, _ = load_checkpoint(batch_path(settings, seed), kind="batch")
     batch = TensorDict(state, batch_size=[len(state["action"])])
-    loc, scale = batch["observation"].mean(0), batch["observation"].std(0).clamp_min(1e-3)
+    observation = batch["observation"]
+    loc, largest = observation.mean(0), observation.abs().amax(0)
+    scale = nonzero_scale(observation.std(0), largest, observation.dtype).clamp_min(1e-3)
     for part in (batch, batch["next"]):
         part["observation"] = (part["observation"] - loc) / scale
     buffer = make_buffer(len(batch), settings)

@@ -62,9 +62,9 @@ def export_policy(
         metadata: JSON-compatible, added to what the file says of the policy.
 
     Raises:
-        BMRLError: for one of ``loc`` and ``scale`` without the other, an ``observation_key`` that
-            the policy does not read, an example without what it reads, or a generator whose actions
-            are no function of a latent.
+        BMRLError: for one of ``loc`` and ``scale`` without the other, a scale that is not finite
+            and positive, an ``observation_key`` that the policy does not read, an example without
+            what it reads, or a generator whose actions are no function of a latent.
         MissingExtraError: without the packages that write ONNX.
 
     Example:
@@ -134,6 +134,8 @@ class _Acting(nn.Module):
         super().__init__()
         if (loc is None) != (scale is None):
             raise BMRLError(f"loc is {loc} and scale is {scale}; valid: both, or neither")
+        if scale is not None and not (scale.isfinite() & (scale > 0)).all():
+            raise BMRLError(f"scale is {scale.tolist()}; valid: finite numbers above 0")
         if loc is not None and observation_key not in policy.in_keys:
             raise BMRLError(
                 f"observation_key is {observation_key!r}; valid: what the policy reads, "

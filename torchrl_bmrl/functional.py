@@ -271,3 +271,55 @@ def direction_error(prediction: Tensor, target: Tensor) -> Tensor:
         tensor(1.)
     """
     return 1.0 - F.cosine_similarity(prediction, target, dim=-1)
+
+
+def mean_and_scale(values: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Mean and standard deviation to normalise with, finite for whatever finite numbers.
+
+    .. math:: \mu = \frac{1}{N} \sum_i x_i, \qquad
+              \sigma = \sqrt{\frac{1}{N} \sum_i (x_i - \mu)^2},
+              \text{ or } 1 \text{ where all } x_i \text{ are one number but for rounding}
+
+    (:func:`nonzero_scale`). Sums are float64 and of differences from the first row, in two passes
+    over parts of the data: a small spread around a large number keeps its digits.
+
+    Args:
+        values: floating-point numbers, ``(N, n)``, finite, N of at least 1.
+
+    Returns:
+        mean and scale, float64, ``(n,)`` each.
+
+    Example:
+        >>> mean_and_scale(torch.tensor([[1.0, 0.1], [3.0, 0.1]]))
+        (tensor([2.0000, 0.1000], dtype=torch.float64), tensor([1., 1.], dtype=torch.float64))
+    """
+    low, high = (extreme.double() for extreme in values.aminmax(dim=0))
+    largest = torch.maximum(low.abs(), high.abs())
+    unit = torch.where(largest > 1e150, largest, 1.0)  # the squares of larger numbers are infinite
+    first = values[0].double() / unit
+    parts = values.split(1 << 16)
+    loc = sum((part.double() / unit - first).sum(0) for part in parts) / len(values)
+    square = sum((part.double() / unit - first - loc).square().sum(0) for part in parts)
+    scale = (square / len(values)).sqrt() * unit
+    return (first + loc) * unit, nonzero_scale(scale, largest, values.dtype)
+
+
+def nonzero_scale(scale: Tensor, largest: Tensor, dtype: torch.dtype) -> Tensor:
+    """Standard deviations that can be divided by: 1 in place of those that are rounding alone.
+
+    That is what they are up to two units in the last place of the largest number and, as what is
+    computed from numbers around 1 is off by so much however small it is itself, up to 1e-7, or
+    1e-12 in float64.
+
+    Args:
+        scale: standard deviations, ``(*B)``.
+        largest: magnitude of the numbers that they are of, ``(*B)``.
+        dtype: of these numbers.
+
+    Example:
+        >>> nonzero_scale(torch.tensor([0.0, 1e-17, 0.5]), torch.ones(3), torch.float64)
+        tensor([1.0000, 1.0000, 0.5000])
+    """
+    rounding = 2 * torch.finfo(dtype).eps * largest
+    noise = rounding.clamp_min(1e-12 if dtype == torch.float64 else 1e-7)
+    return torch.where(scale > noise, scale, 1.0)

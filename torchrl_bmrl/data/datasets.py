@@ -14,7 +14,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.collectors.utils import split_trajectories
@@ -32,6 +31,7 @@ from torchrl_bmrl.data.schema import check_episode, layout_of
 from torchrl_bmrl.data.sources import Source, find_format, open_source
 from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.files import new_folder
+from torchrl_bmrl.functional import mean_and_scale
 
 LAYOUT_VERSION = 2
 """Part of a cache's name: another version converts anew."""
@@ -202,9 +202,9 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
         """What is known of the data beside them.
 
         Attributes of the file with its ``env_args`` and ``masks``; ``episodes``, their names in
-        order; ``statistics``, mean (``loc``) and standard deviation (``scale``) of the actions and
-        of every part of the observation that is a vector of floating-point numbers, ready for
-        ``ObservationNorm``.
+        order; ``statistics``, mean (``loc``) and standard deviation (``scale``, 1 where a dimension
+        is constant) of the actions and of every part of the observation that is a vector of
+        floating-point numbers, ready for ``ObservationNorm``.
         """
         return json.loads(self._metadata)
 
@@ -347,7 +347,7 @@ def _statistics(data: TensorDict) -> dict[str, dict[str, list[float]]]:
     statistics = {}
     for key, part in data.items():
         if isinstance(part, Tensor) and part.is_floating_point() and part.ndim == 2:
-            scale, loc = torch.std_mean(part.double(), dim=0, correction=0)
+            loc, scale = mean_and_scale(part)
             statistics[key] = {"loc": loc.tolist(), "scale": scale.tolist()}
     return statistics
 

@@ -24,6 +24,7 @@ from torchrl.envs.transforms import (
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.extras import needs
+from torchrl_bmrl.functional import nonzero_scale
 from torchrl_bmrl.names import composition_stages, gymnasium_id, horizon_of
 
 OBSERVATION_PARTS = (
@@ -225,7 +226,7 @@ class ObservationStatistics:
 
     Attributes:
         loc: mean.
-        scale: standard deviation, at least 1e-3.
+        scale: standard deviation, at least 1e-3; 1 where the observation is constant.
 
     Example:
         >>> ObservationStatistics(loc=torch.zeros(33), scale=torch.ones(33)).scale.shape
@@ -259,7 +260,9 @@ class ObservationStatistics:
         observations = [raw(data.copy()).get("observation").double() for data in datasets]
         loc = torch.stack([x.mean(0) for x in observations]).mean(0)
         second = torch.stack([(x - loc).square().mean(0) for x in observations]).mean(0)
-        return cls(loc.float(), second.sqrt().clamp_min(1e-3).float())
+        largest = torch.stack([x.abs().amax(0) for x in observations]).amax(0)
+        scale = nonzero_scale(second.sqrt(), largest, torch.float32)  # as they were before double()
+        return cls(loc.float(), scale.clamp_min(1e-3).float())
 
 
 def make_observation_transform(statistics: ObservationStatistics | None = None) -> Compose:

@@ -139,7 +139,8 @@ def find_stages(
         seed: Seed of the fit; equal arguments give equal groups.
 
     Returns:
-        Group of each point, shape ``(N,)``, in [0, num_stages).
+        Group of each point, shape ``(N,)``, in [0, num_stages). There are fewer groups where fewer
+        training points differ.
 
     Raises:
         BMRLError: if the points are not finite or of differing sizes, or fewer than the groups.
@@ -163,13 +164,32 @@ def find_stages(
         raise BMRLError(
             f"num_stages is {num_stages}; valid: 1 to {len(training)}, one for each transition"
         )
-    loc, spread = training.mean(0), float(training.std()) or 1.0
-    mixture = GaussianMixture(num_stages, n_init=5, reg_covar=1e-5, random_state=seed)
+    if is_one_point(training):
+        return np.zeros(len(points), dtype=np.int64)
+    # In units of the points' spread, so that reg_covar means the same for every embedding.
+    loc, spread = training.mean(0), float(training.std())
+    training, points = (training - loc) / spread, (points - loc) / spread
+    groups = min(num_stages, len(np.unique(training, axis=0)))
+    mixture = GaussianMixture(groups, n_init=5, reg_covar=1e-5, random_state=seed)
     # Several threads add up in an order that changes from run to run.
     with threadpool_limits(limits=1):
-        # In units of the points' spread, so that reg_covar means the same for every embedding.
-        mixture.fit((training - loc) / spread)
-        return mixture.predict((points - loc) / spread).astype(np.int64)
+        mixture.fit(training)
+        return mixture.predict(points).astype(np.int64)
+
+
+def is_one_point(points: NDArray[np.floating[Any]]) -> bool:
+    """Whether points are all the same but for rounding.
+
+    Args:
+        points: shape ``(N, d)``.
+
+    Example:
+        >>> is_one_point(np.array([[0.1, 0.2], [0.1, 0.2 + 1e-17]]))
+        True
+    """
+    if len(points) < 2:
+        return True
+    return float(np.ptp(points, axis=0).max()) <= 1e-12 * float(np.abs(points).max())
 
 
 def stage_agreement(

@@ -82,13 +82,17 @@ def data_path(
     first, last, between = _points(start, end, data, num_points)
     # Imported here, as scipy.stats is by its neighbours: processes that only roll out do without.
     with needs("reports"):
+        from scipy.sparse import csr_array
         from scipy.sparse.csgraph import dijkstra
         from scipy.spatial.distance import cdist
 
     # Equal points would have hops of cost 0, which csgraph reads as no hop.
     nodes = np.unique(np.vstack([first, last, between]), axis=0)
     source, target = (int(np.flatnonzero((nodes == x).all(1))[0]) for x in (first, last))
-    cost = cdist(nodes, nodes) ** power
+    length = cdist(nodes, nodes)
+    # Of the longest, so that none is too small for its power. In a dense array csgraph takes costs
+    # below 1e-8 for no hops, too.
+    cost = csr_array((length / (length.max() or 1.0)) ** power)
     _, before = dijkstra(cost, indices=source, return_predecessors=True)
     route = [target]
     while route[-1] != source:

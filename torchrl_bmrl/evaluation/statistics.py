@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -111,7 +112,8 @@ def relative_difference(
     The interval is a percentile bootstrap over pairs: ``x[i]`` and ``y[i]`` are episodes from the
     same start and are drawn together, so that a difficult start does not count as a difference.
     Within a group, every stratum is resampled on its own, at its own size, as in
-    :func:`bootstrap_interval`.
+    :func:`bootstrap_interval`. Resamples in which a group's mean of ``y`` is not positive, as where
+    few episodes have a reward, have no difference and are left out.
 
     Args:
         x: Returns of the one policy, shape ``(N,)``.
@@ -148,7 +150,7 @@ def relative_difference(
             index = [part[next(drawn)] for part in group]
             total = sum(theirs[rows].sum(axis=axis) for rows in index)
             gain = sum((ours[rows] - theirs[rows]).sum(axis=axis) for rows in index)
-            ratios.append(gain / total)
+            ratios.append(gain / np.where(total > 0.0, total, np.nan))
         return sum(ratios) / len(ratios)
 
     sizes = [len(part) for group in parts for part in group]
@@ -321,19 +323,28 @@ def _percentiles(
     _check_confidence(confidence)
     # Imported here: scipy.stats takes a second, and processes that only roll out never need it.
     with needs("reports"):
-        from scipy.stats import bootstrap
+        from scipy.stats import DegenerateDataWarning, bootstrap
 
-    interval = bootstrap(
-        samples,
-        statistic,
-        vectorized=True,
-        paired=False,
-        confidence_level=confidence,
-        n_resamples=resamples,
-        method="percentile",
-        rng=np.random.default_rng(seed),
-    ).confidence_interval
-    return float(interval.low), float(interval.high)
+    with warnings.catch_warnings():  # of resamples that are left out below
+        warnings.simplefilter("ignore", DegenerateDataWarning)
+        result = bootstrap(
+            samples,
+            statistic,
+            vectorized=True,
+            paired=False,
+            confidence_level=confidence,
+            n_resamples=resamples,
+            method="percentile",
+            rng=np.random.default_rng(seed),
+        )
+    low, high = result.confidence_interval
+    drawn = result.bootstrap_distribution
+    if np.isnan(drawn).any():
+        drawn, outside = drawn[~np.isnan(drawn)], (1.0 - confidence) / 2.0
+        if not drawn.size:
+            raise BMRLError(f"none of {resamples} resamples has a number; valid: more resamples")
+        low, high = np.quantile(drawn, [outside, 1.0 - outside])
+    return float(low), float(high)
 
 
 def _counts(rows: NDArray[np.int64], size: int) -> NDArray[np.float64]:

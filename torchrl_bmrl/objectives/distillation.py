@@ -299,9 +299,10 @@ class MetaDistillationLoss(KeyedLoss):
             ("reward_scale", reward_scale, zeros + 1),
         ):
             buffer = default if given is None else torch.as_tensor(given).to(zeros)
-            if buffer.shape != zeros.shape or (name.endswith("scale") and not (buffer > 0).all()):
+            valid = buffer.isfinite() & ((buffer > 0) | (name == "qvalue_loc"))
+            if buffer.shape != zeros.shape or not valid.all():
                 raise BMRLError(
-                    f"{name} is {buffer.tolist()}; valid: a number for each of the "
+                    f"{name} is {buffer.tolist()}; valid: a finite number for each of the "
                     f"{self.num_tasks} tasks{', above 0' * name.endswith('scale')}"
                 )
             self.register_buffer(name, buffer)

@@ -67,7 +67,8 @@ def difference(
         tasks: those to compare on.
 
     Returns:
-        Difference and 95% interval; ``None`` if the two share no episode on one of the tasks.
+        Difference and 95% interval; ``None`` if the two share no episode on one of the tasks, or
+        the mean return of ``y`` is not positive on one: there are no shares of it.
 
     Example:
         >>> rows = [
@@ -80,6 +81,11 @@ def difference(
     one, other = _returns(ours, x, tasks), _returns(theirs, y, tasks)
     shared = sorted(one.keys() & other.keys())
     if not shared or {task for task, _, _ in shared} != set(tasks):
+        return None
+    totals: dict[str, float] = dict.fromkeys(tasks, 0.0)
+    for key in shared:
+        totals[key[0]] += other[key]
+    if min(totals.values()) <= 0.0:
         return None
     return relative_difference(
         [one[key] for key in shared],

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.evaluation.embedding import is_one_point
 from torchrl_bmrl.extras import needs
 from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports.tables import task_name
@@ -289,11 +290,16 @@ def success_curves(curves: Mapping[str, Sequence[NDArray[Any]]], *, title: str) 
     Returns:
         PNG image.
 
+    Raises:
+        BMRLError: if there is no curve.
+
     Example:
         >>> curve = np.array([[0, 0.0], [1000, 0.5], [2000, 1.0]])
         >>> success_curves({"latent": [curve, curve / 2], "raw": [0 * curve]}, title="T")[1:4]
         b'PNG'
     """
+    if not curves or not all(curves.values()):
+        raise BMRLError("no curve to draw; valid: at least one for each name")
     figure = Figure(figsize=(6.2, 3.8), layout="constrained")
     axes = figure.subplots()
     _tidy(axes)
@@ -341,6 +347,9 @@ def _tsne(
     chosen = np.arange(count)
     if count > 3000:
         chosen = np.sort(np.random.default_rng(seed).choice(count, 3000, replace=False))
+    points = np.asarray(task_latent, dtype=np.float64)[chosen]
+    if is_one_point(points):  # which has no neighbours to keep
+        return chosen, np.zeros((len(chosen), 2))
     tsne = TSNE(
         n_components=2,
         perplexity=min(30.0, (len(chosen) - 1) / 3),
@@ -349,7 +358,7 @@ def _tsne(
     )
     # Several threads add up in an order that changes from run to run, and so would the map.
     with threadpool_limits(limits=1):
-        return chosen, tsne.fit_transform(np.asarray(task_latent, dtype=np.float64)[chosen])
+        return chosen, tsne.fit_transform(points)
 
 
 def _plane(task_latent: NDArray[Any]) -> tuple[NDArray[np.float64], str]:
@@ -360,6 +369,8 @@ def _plane(task_latent: NDArray[Any]) -> tuple[NDArray[np.float64], str]:
         return points, ""
     if dim == 1:
         return np.pad(points, ((0, 0), (0, 1))), "\n1-D, drawn on a line"
+    if is_one_point(points):  # it has no principal components
+        return np.zeros((len(points), 2)), f"\n{dim}-D, all of it one point"
     with needs("reports"):
         from sklearn.decomposition import PCA
 
