@@ -202,6 +202,10 @@ FAULTS: dict[str, tuple[Callable[[Columns], object], str]] = {
     "no value": (set_row("next.reward", 3, None), r"next\.reward: no value in row \d+"),
     "no list": (set_row("action", 1, None), r"action: no value in row \d+"),
     "no number": (set_row("action", 1, [0.5, None]), r"action: no value in row \d+"),
+    "not finite": (
+        set_row("observation.state", 5, [np.nan] * 3),
+        r"observation\.state: a value that is not finite in row \d+",
+    ),
     "a long list": (set_row("action", 4, [0.0] * 3), r"action: 3 numbers in row \d+; valid: 2"),
     "no flag": (
         lambda c: c.update({"next.done": [0, 0, 2, 0, 0, 1]}),

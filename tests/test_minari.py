@@ -464,9 +464,8 @@ def test_actions_that_are_not_of_their_space_are_refused(
         (gym.Discrete(3), np.array([0, 2, 1])),
         (gym.MultiDiscrete([2, 3]), np.array([[1, 2], [0, 0], [1, 1]])),
         (gym.MultiBinary(2), np.ones((3, 2), np.int8)),
-        (gym.Box(-3, 3, (2, 2)), np.full((3, 2, 2), 3, np.float32)),
     ],
-    ids=["discrete", "several", "binary", "a matrix"],
+    ids=["discrete", "several", "binary"],
 )
 def test_actions_of_any_space_come_back_and_state_no_bounds(
     root: Path, space: gym.Space, actions: np.ndarray
@@ -475,6 +474,11 @@ def test_actions_of_any_space_come_back_and_state_no_bounds(
     (episode,) = read(root / ID)
     assert_same(episode.actions, actions)
     assert "action_bounds" not in read_metadata(root / ID)
+
+
+def test_matrices_state_one_range_or_none(root: Path) -> None:
+    write_actions(gym.Box(-3, 3, (2, 2)), np.full((3, 2, 2), 3, np.float32))
+    assert read_metadata(root / ID)["action_bounds"] == {"low": -3.0, "high": 3.0}
 
 
 @pytest.mark.parametrize(
@@ -912,3 +916,31 @@ def test_a_reward_of_another_layout_is_asked_for(path: Path) -> None:
     remove("episode_1/rewards")(path)
     with open_raw(path) as episodes:
         assert episodes["episode_1"].rewards is None
+
+
+@pytest.mark.parametrize(
+    ("key", "row", "says"),
+    [
+        ("observations/x", -1, "a value that is not finite in row 5"),
+        ("infos/success", 2, "nan in row 2; valid: 0 or 1"),
+    ],
+)
+def test_what_is_not_finite_is_named_as_the_file_has_it(
+    tmp_path: Path, key: str, row: int, says: str
+) -> None:
+    x = np.zeros((6, 3))
+    episode = Episode(
+        observations={"x": x[:-1]},
+        next_observations={"x": x[1:]},
+        actions=np.zeros((5, 2)),
+        rewards=np.zeros(5),
+        terminated=np.zeros(5, bool),
+        extras={"successes": np.zeros(5)},
+    )
+    path = tmp_path / "own" / "lift-v0"
+    write_episodes(path, [episode])
+    with h5py.File(path / "data" / "main_data.hdf5", "r+") as file:
+        file[f"episode_0/{key}"][row] = np.nan
+    with open_raw(path) as episodes, pytest.raises(DataError) as caught:
+        episodes["episode_0"]
+    assert (caught.value.key, caught.value.message) == (f"episode_0/{key}", says)

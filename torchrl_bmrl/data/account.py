@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_bmrl.data.episodes import Episode
+from torchrl_bmrl.data.episodes import Episode, as_success
 from torchrl_bmrl.data.options import ReadOptions
-from torchrl_bmrl.data.raw import RawEpisode
+from torchrl_bmrl.data.raw import RawEpisode, rewards_of
 from torchrl_bmrl.errors import DataError
 
 WAYS_OUT = (
@@ -74,6 +74,7 @@ class Account:
         cut: last steps without an observation after them.
         failed: episodes that did not succeed, left out on request.
         arrays: in how many episodes each array or group is left alone.
+        contradictions: episodes whose attribute ``success`` is not what ``successes`` say.
 
     Example:
         >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.ones(5)
@@ -89,6 +90,7 @@ class Account:
     cut: Tally = field(default_factory=Tally)
     failed: Tally = field(default_factory=Tally)
     arrays: Counter[str] = field(default_factory=Counter)
+    contradictions: int = 0
 
     def add(self, episode: Episode) -> None:
         """Counts an episode that was read, and what was left out of it."""
@@ -96,10 +98,14 @@ class Account:
         left = episode.left_out
         self.cut += Tally(0, left.steps, left.reward, int(left.reward != 0), int(left.success))
         self.arrays.update(left.arrays)
+        said = as_success(episode.attributes.get("success"))
+        self.contradictions += said not in (None, episode.succeeded or left.success)
 
-    def add_failure(self, raw: RawEpisode) -> None:
+    def add_failure(self, raw: RawEpisode, options: ReadOptions) -> None:
         """Counts an episode that is left out, since it did not succeed."""
-        rewards = np.zeros(len(raw.actions)) if raw.rewards is None else raw.rewards
+        rewards = np.zeros(len(raw.actions))
+        if raw.rewards is not None or options.reward is not None:
+            rewards = rewards_of("", "", raw, options)
         self.failed.include(rewards, raw.succeeded)
 
     @property
@@ -140,6 +146,11 @@ class Account:
             )
         if self.failed.episodes:
             yield f"left out on request, as not successful: {self.failed}"
+        if self.contradictions:
+            yield (
+                f"attribute success contradicts successes in {self.contradictions} episodes; "
+                "successes are believed"
+            )
         if self.arrays:
             named = ", ".join(f"{name} ({count}x)" for name, count in self.arrays.items())
             yield f"left alone in the episodes: {named}"

@@ -36,6 +36,7 @@ from torchrl_bmrl.data.d4rl_layout import (
 )
 from torchrl_bmrl.data.episodes import LazyEpisodes
 from torchrl_bmrl.data.hdf5 import (
+    check_finite,
     open_file,
     read_array,
     read_attributes,
@@ -44,7 +45,6 @@ from torchrl_bmrl.data.hdf5 import (
     read_strings,
 )
 from torchrl_bmrl.data.raw import RawEpisode
-from torchrl_bmrl.errors import DataError
 
 
 def is_d4rl(path: str | Path, file: h5py.File) -> bool:
@@ -184,9 +184,7 @@ def _end_oddities(
 def _read_episode(path: str | Path, file: h5py.File, flat: Flat, rows: slice) -> RawEpisode:
     def read(key: str) -> np.ndarray:
         array = read_array(path, file, key, rows)
-        if array.dtype.kind == "f" and not (finite := np.isfinite(array)).all():
-            row = rows.start + int(np.argwhere(~finite)[0][0])
-            raise DataError(path, key, f"a value that is not finite in row {row}")
+        check_finite(path, key, array, rows.start)
         return array
 
     actions = read("actions")

@@ -84,8 +84,27 @@ class Episode:
         """Whether the task was solved at some step; ``None`` if that is not known."""
         if "successes" in self.extras:
             return bool(np.any(self.extras["successes"]))
-        success = self.attributes.get("success")
-        return bool(success) if isinstance(success, bool | int) else None
+        return as_success(self.attributes.get("success"))
+
+
+def as_success(value: Any) -> bool | None:
+    """What an attribute ``success`` says, in any of the ways that tools write it.
+
+    Args:
+        value: a flag, its name, or a list of one of them.
+
+    Returns:
+        ``None`` where it is neither 0 nor 1.
+
+    Example:
+        >>> as_success([1.0]), as_success("False"), as_success(2)
+        (True, False, None)
+    """
+    if isinstance(value, list) and len(value) == 1:
+        value = value[0]
+    if isinstance(value, str):
+        value = {"true": True, "false": False}.get(value.lower())
+    return bool(value) if isinstance(value, bool | int | float) and value in (0, 1) else None
 
 
 E = TypeVar("E")

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_bmrl.data.episodes import LazyEpisodes
+from torchrl_bmrl.data.hdf5 import check_finite
 from torchrl_bmrl.data.raw import RawEpisode
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.extras import needs
@@ -316,6 +317,9 @@ def _read_episode(layout: _Layout, name: str, tables: _Tables) -> RawEpisode:
     steps = {
         key: _one_number(file, key, arrays[key], rows.start) for key in _STEPS if key in arrays
     }
+    for key, array in arrays.items():
+        if key.startswith("observation."):
+            check_finite(file, key, array, rows.start)
     observations = _parts(layout, arrays)
     known = {
         "action",

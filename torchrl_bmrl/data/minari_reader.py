@@ -16,6 +16,7 @@ import numpy as np
 from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
 from torchrl_bmrl.data.hdf5 import (
     DAMAGE,
+    check_finite,
     open_file,
     read_array,
     read_attributes,
@@ -218,6 +219,7 @@ def _read_episode(path: Path, file: h5py.File, name: str, spaces: Spaces) -> Raw
             arrays[key] = read_array(path, file, f"{name}/{key}")
     for key, space in spaces.parts.items():
         arrays[key] = read_rows(path, file, f"{name}/{key}", space)
+        check_finite(path, f"{name}/{key}", arrays[key])
     steps = _check_lengths(path, name, arrays)
     if spaces.actions.bounds is None:
         _check_range(path, f"{name}/actions", arrays["actions"], spaces.actions)
@@ -297,6 +299,7 @@ def _read_infos(
             if array.shape not in ((steps,), (steps + 1,)):
                 valid = f"{steps} or {steps + 1} rows of one number"
                 raise DataError(path, key, f"shape {array.shape}; valid: {valid}")
+            _flags(path, key, array)
             # Row t + 1 comes after step t.
             extras["successes"] = array[-steps:]
         elif info not in (*STEP_KEYS, "successes") and _has_rows(node, steps):

@@ -56,13 +56,14 @@ class Space:
     @property
     def bounds(self) -> dict[str, Any] | None:
         """Of a finite box of floating-point numbers, for actions; ``None`` of any other space."""
-        whole = (
-            self.dtype.kind == "f" and len(self.shape) < 2 and bool(np.all(self.low < self.high))
-        )
+        whole = self.dtype.kind == "f" and bool(np.all(self.low < self.high))
         # What is as large as float32 goes has no bound in fact.
         if not whole or np.any(np.abs([self.low, self.high]) >= FLOAT32):
             return None
-        return {"low": _shortest(self.low), "high": _shortest(self.high)}
+        low, high = _shortest(self.low), _shortest(self.high)
+        # Lists are for vectors.
+        lists = isinstance(low, list) or isinstance(high, list)
+        return None if lists and len(self.shape) > 1 else {"low": low, "high": high}
 
 
 def _shortest(bound: np.ndarray) -> float | list[float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -67,16 +67,23 @@ class ReadOptions:
             raise ConfigError(f"observation_keys is {keys!r}; valid: a list of names")
         if keys is not None:
             # In their order, each once.
-            object.__setattr__(self, "observation_keys", tuple(dict.fromkeys(keys)))
+            names = tuple(dict.fromkeys(keys))
+            if wrong := [key for key in names if not isinstance(key, str)]:
+                raise ConfigError(f"observation_keys has {wrong[0]!r}; valid: names")
+            object.__setattr__(self, "observation_keys", names)
         for name in ("dones_terminate", "successful"):
-            if not isinstance(getattr(self, name), bool):
-                raise ConfigError(f"{name} is {getattr(self, name)!r}; valid: True, False")
+            value = getattr(self, name)
+            if not isinstance(value, bool | np.bool_):
+                raise ConfigError(f"{name} is {value!r}; valid: True, False")
+            object.__setattr__(self, name, bool(value))
         for name, kind in (("last_step", LastStep), ("reward", Reward)):
             value, valid = getattr(self, name), get_args(kind)
-            if value is not None and value not in valid:
+            if value is not None and not (isinstance(value, str) and value in valid):
                 raise ConfigError(f"{name} is {value!r}; valid: {', '.join(valid)}, None")
-        if self.bounds is not None and self.bounds != "data":
-            object.__setattr__(self, "bounds", check_bounds(self.bounds))
+        bounds: Any = self.bounds
+        # An array would be compared with "data" element by element.
+        if bounds is not None and not (isinstance(bounds, str) and bounds == "data"):
+            object.__setattr__(self, "bounds", check_bounds(bounds))
 
 
 def check_bounds(bounds: Bounds, name: str = "bounds") -> Bounds:

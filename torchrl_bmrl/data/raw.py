@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torchrl_bmrl.data.episodes import Episode, LeftOut
+from torchrl_bmrl.data.episodes import Episode, LeftOut, as_success
 from torchrl_bmrl.data.options import ReadOptions
 from torchrl_bmrl.errors import DataError
 
@@ -26,7 +26,6 @@ class RawEpisode:
         rewards: ``(T,)``.
         terminated: ``(T,)`` bool; where no value follows.
         dones: ``(T,)`` bool; where an episode ends, whatever the reason.
-        success: whether the episode succeeded, as its attribute says.
         extras: further arrays of T rows, such as ``successes``.
         attributes: numbers, strings and lists of strings.
         left_alone: names of what is there and not read.
@@ -38,7 +37,6 @@ class RawEpisode:
     rewards: np.ndarray | None = None
     terminated: np.ndarray | None = None
     dones: np.ndarray | None = None
-    success: bool | None = None
     extras: Mapping[str, np.ndarray] = field(default_factory=dict)
     attributes: Mapping[str, Any] = field(default_factory=dict)
     left_alone: tuple[str, ...] = ()
@@ -47,7 +45,9 @@ class RawEpisode:
     def succeeded(self) -> bool | None:
         """Whether the task was solved at some step; ``None`` where the file does not say."""
         successes = self.extras.get("successes")
-        return self.success if successes is None else bool(np.any(successes))
+        if successes is None:
+            return as_success(self.attributes.get("success"))
+        return bool(np.any(successes))
 
 
 def complete(path: str | Path, name: str, raw: RawEpisode, options: ReadOptions) -> Episode:
@@ -63,8 +63,8 @@ def complete(path: str | Path, name: str, raw: RawEpisode, options: ReadOptions)
         the episode; its ``left_out`` says what of the file it does not hold.
 
     Raises:
-        DataError: naming file and key, for rewards that neither the file nor the options tell, and
-            if no step is left.
+        DataError: naming file and key, for rewards that neither the file nor the options tell, for
+            a part of the observation that is asked for and missing, and if no step is left.
 
     Example:
         >>> raw = RawEpisode(
@@ -76,8 +76,10 @@ def complete(path: str | Path, name: str, raw: RawEpisode, options: ReadOptions)
         >>> len(complete("lift.hdf5", "demo_0", raw, ReadOptions(last_step="truncate")))
         5
     """
+    if options.observation_keys is not None:
+        raw = _choose_parts(path, name, raw, options.observation_keys)
     steps = len(raw.actions)
-    rewards = _rewards(path, name, raw, options)
+    rewards = rewards_of(path, name, raw, options)
     terminated = np.zeros(steps, bool) if raw.terminated is None else np.asarray(raw.terminated)
     if raw.terminated is None and options.dones_terminate:
         if raw.dones is None:
@@ -97,7 +99,7 @@ def complete(path: str | Path, name: str, raw: RawEpisode, options: ReadOptions)
         else:
             after = {key: part[1:] for key, part in before.items()}
             before = {key: part[:-1] for key, part in before.items()}
-            kept = steps - 1
+            kept = max(0, steps - 1)
     if steps and not kept:
         message = "a single step, and no observation after it was recorded"
         raise DataError(path, name, f"{message}; valid: last_step 'truncate' or 'terminate'")
@@ -138,14 +140,38 @@ def _cut(path: str | Path, name: str, episode: Episode, kept: int) -> Episode:
     )
 
 
-def _rewards(path: str | Path, name: str, raw: RawEpisode, options: ReadOptions) -> np.ndarray:
+def _choose_parts(path: str | Path, name: str, raw: RawEpisode, keys: Iterable[str]) -> RawEpisode:
+    for key in keys:
+        if key not in raw.observations:
+            valid = ", ".join(raw.observations)
+            raise DataError(path, f"{name}/{key}", f"no part of the observation; valid: {valid}")
+    after = raw.next_observations
+    return replace(
+        raw,
+        observations={key: raw.observations[key] for key in keys},
+        next_observations=None if after is None else {key: after[key] for key in keys},
+    )
+
+
+def success_fault(raw: RawEpisode) -> str:
+    """Why it is not known whether an episode succeeded."""
+    if (said := raw.attributes.get("success")) is not None:
+        return f"attribute success is {said!r}, neither 0 nor 1, and there are no successes"
+    return "neither an attribute success nor successes"
+
+
+def rewards_of(path: str | Path, name: str, raw: RawEpisode, options: ReadOptions) -> np.ndarray:
+    """Rewards of an episode, from where the options say.
+
+    Raises:
+        DataError: naming file and key, where neither they nor the file tell.
+    """
     last = np.arange(len(raw.actions)) == len(raw.actions) - 1
     if options.reward == "last":
         return last.astype(np.float32)
     if options.reward == "success":
         if raw.succeeded is None:
-            message = "neither an attribute success nor successes; valid: reward 'last', or none"
-            raise DataError(path, name, message)
+            raise DataError(path, name, f"{success_fault(raw)}; valid: reward 'last', or none")
         return np.asarray(raw.extras.get("successes", last & raw.succeeded), dtype=np.float32)
     if raw.rewards is None:
         message = "missing; valid: rewards (T,), or the option reward 'success' or 'last'"

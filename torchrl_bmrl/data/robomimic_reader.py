@@ -8,6 +8,7 @@ others: no ``next_obs``, no ``rewards``, an attribute ``success`` in place of an
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ import numpy as np
 from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
 from torchrl_bmrl.data.hdf5 import (
     DAMAGE,
+    check_finite,
     open_file,
     read_array,
     read_attribute,
@@ -142,7 +144,7 @@ def _demonstrations(path: str | Path, file: h5py.File) -> tuple[list[str], list[
     beside: list[str] = []
     for name in read_names(path, file, "data"):
         # What is named like one is one, damaged or not.
-        found = name.startswith("demo") or _is_demonstration(path, file, f"data/{name}")
+        found = re.fullmatch(r"demo_?\d+", name) or _is_demonstration(path, file, f"data/{name}")
         (names if found else beside).append(name)
     return names, beside
 
@@ -241,7 +243,7 @@ def _read_raw(
     if not steps["actions"].ndim:
         raise DataError(path, f"{demo}/actions", "one number; valid: (T, action_dim)")
     if "rewards" in present:
-        steps["rewards"] = read_array(path, file, f"{demo}/rewards")
+        steps["rewards"] = _read_column(path, file, f"{demo}/rewards")
     if "terminated" in present:
         steps["terminated"] = _read_flags(path, file, f"{demo}/terminated")
     elif options.dones_terminate:
@@ -251,8 +253,12 @@ def _read_raw(
         after = {part: read_array(path, file, _next(key)) for part, key in parts.items()}
         beside += _not_read(path, file, f"{demo}/next_obs", parts)
     if "successes" in present and (extras is None or "successes" in extras):
-        steps["successes"] = read_array(path, file, f"{demo}/successes")
+        steps["successes"] = _read_column(path, file, f"{demo}/successes")
+        _check_flags(path, f"{demo}/successes", steps["successes"])
     if after is None:
+        # What the next observations are made of is to be named as the file has it.
+        for part, key in parts.items():
+            check_finite(path, key, observations[part])
         _check_lengths(path, demo, steps, observations, _rows_of_dones(path, file, demo))
     elif "dones" in steps and steps["dones"].shape != steps["actions"].shape[:1]:
         message = f"shape {steps['dones'].shape}; valid: {steps['actions'].shape[:1]}"
@@ -267,8 +273,12 @@ def _read_raw(
             further[key] = read_array(path, file, f"{demo}/{key}")
         elif extras is None:
             beside.append(key)
-    told = read_attributes(path, file, demo) if attributes else {}
-    told.pop("num_samples", None)
+    if attributes:
+        told = read_attributes(path, file, demo)
+        told.pop("num_samples", None)
+    else:
+        success = read_attribute(path, file, demo, "success")
+        told = {} if success is None else {"success": success}
     return RawEpisode(
         observations=observations,
         next_observations=after,
@@ -276,7 +286,6 @@ def _read_raw(
         rewards=steps.get("rewards"),
         terminated=steps.get("terminated"),
         dones=steps.get("dones"),
-        success=_read_success(path, file, demo),
         extras=further,
         attributes=told,
         left_alone=tuple(beside),
@@ -338,6 +347,8 @@ def _check_lengths(
     for key, array in keys.items():
         if not array.ndim:
             raise DataError(path, f"{demo}/{key}", "one number; valid: a row for each step")
+        if key in steps and key != "actions" and array.ndim > 1:
+            raise DataError(path, f"{demo}/{key}", f"shape {array.shape}; valid: ({len(array)},)")
     rows = [len(array) for array in observations.values()]
     # Observations come before each action, or also after the last.
     likely = Counter([*(len(array) for array in steps.values()), *others])
@@ -373,17 +384,22 @@ def _has_rows(path: str | Path, file: h5py.File, key: str, steps: int) -> bool:
 
 
 def _read_flags(path: str | Path, file: h5py.File, key: str) -> np.ndarray:
-    flags = read_array(path, file, key)
-    wrong = np.flatnonzero((flags != 0) & (flags != 1))
-    if len(wrong):
-        raise DataError(path, key, f"{flags.flat[wrong[0]]} in row {wrong[0]}; valid: 0 or 1")
+    flags = _read_column(path, file, key)
+    _check_flags(path, key, flags)
     return flags.astype(bool)
 
 
-def _read_success(path: str | Path, file: h5py.File, demo: str) -> bool | None:
-    """What the attribute ``success`` of a demonstration says, if it has one."""
-    value = read_attribute(path, file, demo, "success")
-    return bool(value) if isinstance(value, bool | int | float) and value in (0, 1) else None
+def _check_flags(path: str | Path, key: str, flags: np.ndarray) -> None:
+    for where in map(tuple, np.argwhere((flags != 0) & (flags != 1))):
+        raise DataError(path, key, f"{flags[where]} in row {where[0]}; valid: 0 or 1")
+
+
+def _read_column(path: str | Path, file: h5py.File, key: str) -> np.ndarray:
+    """An array of one number a step, which some tools keep as ``(T, 1)``."""
+    array = read_array(path, file, key)
+    if not array.ndim:
+        raise DataError(path, key, "one number; valid: a row for each step")
+    return array[:, 0] if array.shape[1:] == (1,) else array
 
 
 # -- the file as a whole ---------------------------------------------------------------------------
@@ -473,7 +489,7 @@ def _find_contradictions(path: str | Path, file: h5py.File, names: list[str]) ->
                 return
             total += len(node)
             said = read_attribute(path, file, f"data/{name}", "num_samples")
-            if said is not None and said != len(node):
+            if not _says(said, len(node)):
                 wrong.append(f"{name} says {said} of {len(node)}")
         said = read_attribute(path, file, "data", "total")
     except DataError:  # told by whoever reads the episodes
@@ -483,5 +499,12 @@ def _find_contradictions(path: str | Path, file: h5py.File, names: list[str]) ->
             f"attribute num_samples contradicts the arrays in {len(wrong)} episodes, such as "
             f"{wrong[0]} steps; the arrays are believed"
         )
-    if said is not None and said != total:
+    if not _says(said, total):
         yield f"attribute total says {said} steps, the arrays have {total}, and are believed"
+
+
+def _says(said: Any, count: int) -> bool:
+    """Whether an attribute is missing, or that number in any of the ways that tools write it."""
+    if isinstance(said, list) and len(said) == 1:
+        said = said[0]
+    return said is None or said == count or said == str(count)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,15 @@ from torchrl_bmrl.data import d4rl, lerobot_reader, minari, robomimic, robosuite
 from torchrl_bmrl.data.account import Account
 from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
 from torchrl_bmrl.data.hdf5 import open_file, read_names
-from torchrl_bmrl.data.options import Bounds, ReadOptions
-from torchrl_bmrl.data.raw import RawEpisode, complete
+from torchrl_bmrl.data.options import Bounds, ReadOptions, check_bounds
+from torchrl_bmrl.data.raw import RawEpisode, complete, success_fault
 from torchrl_bmrl.errors import ConfigError, DataError
 
+_STRUCTURE = (
+    *("total_episodes", "total_steps", "dataset_size", "dataset_id", "minari_version"),
+    *("data_format", "observation_space", "action_space", "total", "masks"),
+)
+"""What a data set says of itself that is not true of a copy in another format."""
 FORMATS = ("robomimic", "robosuite", "minari", "d4rl", "lerobot")
 
 
@@ -54,11 +59,23 @@ class Source:
     @property
     def fps(self) -> float | None:
         """Steps per second [Hz], where the data set tells them."""
-        kwargs = self.metadata.get("env_args", {}).get("env_kwargs") or {}
-        for known in (self.metadata.get("fps"), kwargs.get("control_freq")):
-            if isinstance(known, int | float) and 0 < known < float("inf"):
+        kwargs = self.metadata.get("env_args", {}).get("env_kwargs")
+        rate = kwargs.get("control_freq") if isinstance(kwargs, dict) else None
+        for known in (self.metadata.get("fps"), rate):
+            if isinstance(known, bool) or not isinstance(known, int | float):
+                continue
+            if 0 < known < float("inf"):
                 return float(known)
         return None
+
+    def check(self) -> None:
+        """Refuses a data set in which something is wrong beside the episodes.
+
+        Raises:
+            DataError: for the first of :attr:`problems`.
+        """
+        for key, message in self.problems:
+            raise DataError(self.path, key, message)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,32 +206,38 @@ def _choose(path: Path, opened: _Opened, options: ReadOptions, account: Account)
             names.append(name)
             continue
         if raw.succeeded is None:
-            message = "neither an attribute success nor successes; valid: successful=False"
+            message = f"{success_fault(raw)}; valid: successful=False"
             raise DataError(path, f"{opened.prefix}{name}", message)
         if raw.succeeded:
             names.append(name)
         else:
-            account.add_failure(raw)
+            account.add_failure(raw, options)
     if not names:
         raise DataError(path, None, f"no episode succeeded of {len(opened.episodes)}")
     return names
 
 
 def _range_of_actions(episodes: Mapping[str, RawEpisode], names: list[str]) -> Bounds:
-    """Smallest and largest action in each dimension, ±1 around one that is constant."""
+    """Smallest and largest action in each dimension, ±1 around one that is constant.
+
+    Of actions that are no vectors it is one range for all numbers; whole numbers have no bounds.
+    """
     low, high = np.array(np.inf), np.array(-np.inf)
     for name in names:
         try:
-            actions = np.asarray(episodes[name].actions, dtype=np.float64)
-            low = np.minimum(low, actions.min(axis=0))
-            high = np.maximum(high, actions.max(axis=0))
+            actions = episodes[name].actions
+            if actions.dtype.kind != "f":
+                return -1.0, 1.0
+            each = 0 if actions.ndim == 2 else None
+            low = np.minimum(low, actions.min(axis=each)).astype(np.float64)
+            high = np.maximum(high, actions.max(axis=each)).astype(np.float64)
         except (DataError, ValueError):  # found again, and reported, when it is read
             continue
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         return -1.0, 1.0
     constant = low == high
     low, high = low - constant, high + constant
-    return tuple(np.atleast_1d(low).tolist()), tuple(np.atleast_1d(high).tolist())
+    return check_bounds((low, high))
 
 
 def _open_robomimic(stack: ExitStack, path: Path, options: ReadOptions, to_train: bool) -> _Opened:
@@ -237,12 +260,23 @@ def _open_other(stack: ExitStack, path: Path, form: str, options: ReadOptions) -
     told = reader.read_metadata(path)
     # As gymnasium's environments are in robomimic's layout.
     env_args = {"env_name": told.get("dataset_id", path.stem), "type": 2, "env_kwargs": {}}
-    kept = ("fps", "action_bounds", "task")
+    further_told = {**told, **told.get("attributes", {}), **told.get("metadata", {})}
+    kept = {
+        key: value
+        for key, value in further_told.items()
+        if key == "action_bounds" or (key not in _STRUCTURE and _fits_attribute(value))
+    }
     return _Opened(
         episodes=episodes,
-        metadata={"env_args": env_args} | {key: told[key] for key in kept if key in told},
+        metadata={**kept, "env_args": env_args},
         oddities=reader.find_oddities(path, **further),
     )
+
+
+def _fits_attribute(value: Any) -> bool:
+    """Whether it is a number, a text, or a list of one of both."""
+    values = value if isinstance(value, list) else [value]
+    return any(all(isinstance(x, kind) for x in values) for kind in (str, int | float))
 
 
 def _open_robosuite(stack: ExitStack, path: Path, task: str | None, tracking: float) -> _Opened:
@@ -266,6 +300,30 @@ def _open_robosuite(stack: ExitStack, path: Path, task: str | None, tracking: fl
     )
 
 
+def with_joint_range(sources: Sequence[Source]) -> list[Source]:
+    """The sources, bounded by the range of all their actions if they are by their own."""
+    if sources[0].options.bounds != "data" or len(sources) == 1:
+        return list(sources)
+    lows, highs = zip(*(source.bounds for source in sources), strict=True)
+    try:
+        low, high = np.min(np.stack(lows), axis=0), np.max(np.stack(highs), axis=0)
+    except ValueError:  # of other sizes, which whoever reads the episodes says
+        return list(sources)
+    bounds = check_bounds((low, high))
+    told = {} if bounds == (-1.0, 1.0) else {"action_bounds": {"low": bounds[0], "high": bounds[1]}}
+    return [
+        replace(source, bounds=bounds, metadata={**source.metadata, **told}) for source in sources
+    ]
+
+
+def _equal(one: Bounds, other: Bounds) -> bool:
+    """Whether bounds are equal, one number for all dimensions or one for each."""
+    try:
+        return bool(np.all(np.equal(one[0], other[0])) and np.all(np.equal(one[1], other[1])))
+    except ValueError:
+        return False
+
+
 def joined(sources: Sequence[Source]) -> Mapping[str, Any]:
     """Metadata of several sources together: what they agree in, and masks by name.
 
@@ -273,7 +331,7 @@ def joined(sources: Sequence[Source]) -> Mapping[str, Any]:
         ConfigError: for bounds of actions that differ.
     """
     first = sources[0]
-    if wrong := [source for source in sources if source.bounds != first.bounds]:
+    if wrong := [source for source in sources if not _equal(source.bounds, first.bounds)]:
         raise ConfigError(
             f"actions of {wrong[0].path} are bounded by {wrong[0].bounds}, those of {first.path} "
             f"by {first.bounds}; valid: equal bounds, such as bounds= for all"
