@@ -282,3 +282,43 @@ def test_human_recordings_are_checked_converted_and_loaded(tmp_path: Path, capsy
     assert data["next", "truncated"].sum() == 2
     assert not data["next", "success"].any()
     assert data["robot0_eef_pos"].shape == (421, 3)
+
+
+def test_steps_per_second_that_are_told_are_kept_and_checked(path: Path, tmp_path: Path) -> None:
+    convert(path, tmp_path / "a.hdf5", to="robomimic", fps=30)
+    with open_source(tmp_path / "a.hdf5") as source:
+        assert source.fps == 30
+    with pytest.raises(ConfigError, match="fps is -1"):
+        convert(path, tmp_path / "b.hdf5", to="robomimic", fps=-1)
+
+
+@pytest.mark.parametrize("kwargs", [[1], "x", {"control_freq": True}, None])
+def test_odd_env_kwargs_tell_no_control_rate(path: Path, kwargs: Any) -> None:
+    with h5py.File(path, "r+") as file:
+        file["data"].attrs["env_args"] = json.dumps({"env_kwargs": kwargs})
+    with open_source(path) as source:
+        assert source.fps is None
+
+
+def test_what_other_formats_say_of_a_data_set_is_kept_or_named(tmp_path: Path) -> None:
+    flat = tmp_path / "flat.hdf5"
+    with h5py.File(flat, "w") as file:
+        file["observations"], file["actions"] = np.zeros((9, 3)), np.zeros((9, 2))
+        file["rewards"], file["terminals"] = np.ones(9), np.arange(9) == 8
+        file["timeouts"] = np.zeros(9)
+        file.attrs["author"], file["metadata/algorithm"] = "me", "SAC"
+    convert(flat, tmp_path / "a.hdf5", to="robomimic")
+    told = robomimic.read_metadata(tmp_path / "a.hdf5")
+    assert (told["author"], told["algorithm"]) == ("me", "SAC")
+    notes = convert(flat, tmp_path / "own" / "flat-v0", to="minari").notes
+    assert any("no place for it: author, algorithm" in note for note in notes)
+
+
+def test_whole_numbers_that_become_floats_are_named(path: Path, tmp_path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        for demo in file["data"].values():
+            actions = np.zeros(demo["actions"].shape, np.int8)
+            del demo["actions"]
+            demo["actions"] = actions
+    notes = convert(path, tmp_path / "a", to="lerobot", fps=20).notes
+    assert "whole numbers become float32" in notes

@@ -156,7 +156,9 @@ def expected(known: Known, options: dict[str, Any]) -> dict[str, Any] | None:
         given = options.get("reward")
         if options.get("successful") and not success:
             recorded = rewards if known.has_rewards else np.zeros(steps)
-            total["left out"] += steps, recorded.sum(), 0
+            # By the rule of the episodes that are read: a sum of two sorts would be none.
+            left = {None: recorded.sum(), "success": 0, "last": 1}[given]
+            total["left out"] += steps, left, 0
             continue
         chosen += 1
         if given == "success" and success is None:

@@ -399,6 +399,7 @@ def test_bounds_of_another_size_are_named(tmp_path: Path) -> None:
         {"bounds": 3},
         {"bounds": "range"},
         {"observation_keys": 5},
+        {"reward": np.array(["last"])},
     ],
     ids=str,
 )
@@ -469,3 +470,210 @@ def test_a_recording_of_robosuite_is_answered_with_the_command_that_converts_it(
         file["data/demo_1/states"] = np.zeros((3, 34))
     with pytest.raises(DataError, match=r"convert .* --to robomimic --task TASK"):
         load(tmp_path / "demo.hdf5")
+
+
+# -- what strangers' files have otherwise ----------------------------------------------------------
+
+LAST = np.arange(STEPS) == STEPS - 1
+
+
+@pytest.mark.parametrize("key", ["rewards", "dones", "terminated", "successes"])
+@pytest.mark.parametrize("next_obs", [True, False])
+def test_one_number_a_step_may_be_a_column(tmp_path: Path, key: str, next_obs: bool) -> None:
+    flat = write(tmp_path / "a.hdf5", put(key, 1.0 * LAST), next_obs=next_obs)
+    column = write(tmp_path / "b.hdf5", put(key, 1.0 * LAST[:, None]), next_obs=next_obs)
+    options = {"dones_terminate": True, "last_step": "truncate"}
+    assert (load(flat, **options)[:] == load(column, **options)[:]).all()
+
+
+@pytest.mark.parametrize("key", ["rewards", "dones", "terminated", "successes"])
+def test_two_numbers_a_step_are_named_with_the_shape_that_the_file_has(
+    tmp_path: Path, capsys: Any, key: str
+) -> None:
+    path = write(tmp_path / "a.hdf5", put(key, np.zeros((STEPS, 2))))
+    code, _, err = checked(path, capsys, "--dones-terminate")
+    assert code == 1
+    assert f"data/demo_0/{key}: shape ({STEPS}, 2); valid: ({STEPS},)" in err
+    with pytest.raises(DataError, match=rf"demo_0/{key}: shape \({STEPS}, 2\)"):
+        load(path, dones_terminate=True)
+
+
+@pytest.mark.parametrize("value", [7, np.nan])
+def test_a_success_that_is_neither_0_nor_1_is_found_in_a_step_that_is_left_out(
+    tmp_path: Path, value: float
+) -> None:
+    path = write(tmp_path / "a.hdf5", put("successes", np.where(LAST, value, 1.0)))
+    with pytest.raises(DataError, match=f"demo_0/successes: .* in row {STEPS - 1}; valid: 0 or 1"):
+        load(path, last_step="drop")
+
+
+def test_an_episode_without_steps_is_named(tmp_path: Path, capsys: Any) -> None:
+    def empty(demo: Any) -> None:
+        for key in ("obs/x", "actions", "rewards", "dones"):
+            put(key, demo[key][:0])(demo)
+
+    code, _, err = checked(write(tmp_path / "a.hdf5", empty), capsys)
+    assert code == 1
+    assert "data/demo_0/actions: shape (0, 7)" in err
+
+
+def test_a_last_observation_that_is_not_finite_is_named_as_the_file_has_it(tmp_path: Path) -> None:
+    observations = np.zeros((STEPS + 1, 3))
+    observations[-1] = np.nan
+    path = write(tmp_path / "a.hdf5", put("obs/x", observations))
+    with pytest.raises(DataError, match=f"demo_0/obs/x: .* not finite in row {STEPS}"):
+        load(path)
+
+
+@pytest.mark.parametrize("value", [1.0, np.bool_(True), b"True", "true", np.array([True])])
+def test_the_attribute_success_means_the_same_to_every_command(
+    tmp_path: Path, capsys: Any, value: Any
+) -> None:
+    path = write(tmp_path / "a.hdf5", tell("success", value), next_obs=True)
+    code, out, _ = checked(path, capsys)
+    assert code == 0
+    assert "read              4 episodes, 80 steps, reward 4, 4 successes" in out
+    assert load(path).metadata["account"]["read"]["successes"] == EPISODES
+    assert convert(path, tmp_path / "b.hdf5", to="robomimic").account.read.successes == EPISODES
+    assert float(load(path, reward="success")[:]["next", "reward"].sum()) == EPISODES
+
+
+def test_an_attribute_success_that_says_nothing_is_named_with_its_value(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.hdf5", tell("success", 2), next_obs=True)
+    with pytest.raises(DataError, match="attribute success is 2, neither 0 nor 1"):
+        load(path, successful=True)
+    assert load(path).metadata["account"]["read"]["successes"] == 0
+
+
+def test_an_attribute_success_that_contradicts_successes_is_said(
+    tmp_path: Path, capsys: Any
+) -> None:
+    edits = tell("success", True), put("successes", np.zeros(STEPS, bool))
+    path = write(tmp_path / "a.hdf5", *edits, next_obs=True)
+    says = "attribute success contradicts successes in 4 episodes; successes are believed"
+    assert says in checked(path, capsys)[1]
+    assert says in load(path).metadata["warnings"]
+
+
+def test_the_attribute_success_goes_through_minari(tmp_path: Path) -> None:
+    pytest.importorskip("minari")
+    path = write(tmp_path / "a.hdf5", tell("success", lambda i: bool(i % 2)), next_obs=True)
+    target = tmp_path / "own" / "lift-v0"
+    convert(path, target, to="minari")
+    done = convert(target, tmp_path / "b.hdf5", to="robomimic", successful=True, reward="success")
+    assert (done.account.read.episodes, done.account.read.reward) == (2, 2.0)
+
+
+def test_what_is_left_out_is_rewarded_as_what_is_read(tmp_path: Path) -> None:
+    """A sum of two sorts of reward would be none."""
+    path = write(tmp_path / "a.hdf5", tell("success", lambda i: bool(i % 2)), next_obs=True)
+    account = load(path, successful=True, reward="success").metadata["account"]
+    assert (account["read"]["reward"], account["failed"]["reward"]) == (2.0, 0.0)
+
+
+@pytest.mark.parametrize("name", ["demo_info", "demonstrations", "demo_0_meta"])
+def test_a_data_set_that_is_named_nearly_like_a_demonstration_is_left_alone(
+    tmp_path: Path, capsys: Any, name: str
+) -> None:
+    path = write(tmp_path / "a.hdf5", next_obs=True)
+    with h5py.File(path, "r+") as file:
+        file[f"data/{name}"] = np.zeros(4)
+    code, out, _ = checked(path, capsys)
+    assert code == 0
+    assert f"left alone, beside the demonstrations: data/{name}" in out
+
+
+@pytest.mark.parametrize("value", ["20", 20.0, np.array([20])])
+def test_a_number_of_steps_is_no_contradiction_however_it_is_written(
+    tmp_path: Path, capsys: Any, value: Any
+) -> None:
+    path = write(tmp_path / "a.hdf5", tell("num_samples", value), next_obs=True)
+    assert "contradicts" not in checked(path, capsys)[1]
+
+
+def test_a_faulty_mask_stops_loading_as_it_stops_the_other_commands(
+    tmp_path: Path, capsys: Any
+) -> None:
+    path = write(tmp_path / "a.hdf5", next_obs=True)
+    with h5py.File(path, "r+") as file:
+        file["mask/train"] = [b"demo_9"]
+    assert checked(path, capsys)[0] == 1
+    for read in (load, lambda path: convert(path, tmp_path / "b.hdf5", to="robomimic")):
+        with pytest.raises(DataError, match="mask/train: row 0 names 'demo_9'"):
+            read(path)
+
+
+@pytest.mark.parametrize("to", ["minari", "lerobot"])
+def test_parts_of_the_observation_are_chosen_from_every_format(
+    tmp_path: Path, capsys: Any, to: str
+) -> None:
+    pytest.importorskip("minari" if to == "minari" else "pyarrow")
+    more = put("obs/y", np.ones((STEPS, 2))), put("next_obs/y", np.ones((STEPS, 2)))
+    path, source = write(tmp_path / "a.hdf5", *more, next_obs=True), tmp_path / "own" / "lift-v0"
+    convert(path, source, to=to, fps=20)
+    target = tmp_path / "b.hdf5"
+    convert(source, target, to="robomimic", observation_keys=["y"], last_step="truncate")
+    with h5py.File(target) as file:
+        assert list(file["data/demo_0/obs"]) == ["y"]
+    code, _, err = checked(source, capsys, "--observation-keys", "z", "--last-step", "drop")
+    assert code == 1
+    assert "episode_0/z: no part of the observation; valid: x, y" in err
+
+
+# -- bounds and several files, as strangers write them ---------------------------------------------
+
+
+def test_whole_numbers_have_no_range_of_data(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.hdf5", put("actions", np.full((STEPS, 7), 5)), next_obs=True)
+    assert "action_bounds" not in load(path, bounds="data").metadata
+
+
+@pytest.mark.parametrize("shape", [(STEPS,), (STEPS, 2, 3)])
+def test_actions_that_are_no_vectors_have_one_range(
+    tmp_path: Path, capsys: Any, shape: tuple[int, ...]
+) -> None:
+    pytest.importorskip("minari")
+    actions = np.linspace(-3, 2, int(np.prod(shape))).reshape(shape)
+    path = write(tmp_path / "a.hdf5", put("actions", actions), next_obs=True)
+    assert checked(path, capsys, "--bounds", "data")[0] == 0
+    target = tmp_path / "own" / "lift-v0"
+    convert(path, target, to="minari", bounds="data")
+    with open_source(target) as source:
+        assert source.bounds == (-3.0, 2.0)
+
+
+def test_bounds_may_be_an_array(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.hdf5", next_obs=True)
+    told = load(path, bounds=np.array([-2.0, 2.0])).metadata["action_bounds"]
+    assert told == {"low": -2.0, "high": 2.0}
+
+
+def test_files_become_one_with_the_range_of_them_all(tmp_path: Path) -> None:
+    low, high = np.linspace(-3, 0, STEPS)[:, None], np.linspace(0, 2, STEPS)[:, None]
+    one = write(tmp_path / "a.hdf5", put("actions", low), next_obs=True)
+    other = write(tmp_path / "b.hdf5", put("actions", high), next_obs=True)
+    convert([one, other], tmp_path / "c.hdf5", to="robomimic", bounds="data")
+    assert read_metadata(tmp_path / "c.hdf5")["action_bounds"] == {"low": [-3.0], "high": [2.0]}
+
+
+def test_equal_bounds_are_equal_however_they_are_written(tmp_path: Path) -> None:
+    one, other = (write(tmp_path / f"{name}.hdf5", next_obs=True) for name in "ab")
+    with h5py.File(other, "r+") as file:
+        file["data"].attrs["action_bounds"] = json.dumps({"low": [-1] * 7, "high": [1] * 7})
+    done = convert([one, other], tmp_path / "c.hdf5", to="robomimic")
+    assert done.account.read.episodes == 2 * EPISODES
+    assert not any("action_bounds" in note for note in done.notes)
+
+
+def test_a_mask_that_some_of_the_files_lack_is_said(tmp_path: Path) -> None:
+    one, other = (write(tmp_path / f"{name}.hdf5", next_obs=True) for name in "ab")
+    with h5py.File(one, "r+") as file:
+        file["mask/train"] = [b"demo_0"]
+    done = convert([one, other], tmp_path / "c.hdf5", to="robomimic")
+    assert any(f"mask train has no episode of {other}" in note for note in done.notes)
+
+
+def test_an_iterator_of_keys_serves_all_files(tmp_path: Path) -> None:
+    files = [write(tmp_path / f"{name}.hdf5", next_obs=True) for name in "ab"]
+    done = convert(files, tmp_path / "c.hdf5", to="robomimic", observation_keys=iter(["x"]))
+    assert done.account.read.episodes == 2 * EPISODES

@@ -216,7 +216,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parts.add_argument("source", type=Path, nargs="+", help=f"{source}; several become one")
     parts.add_argument("out", type=Path, help="new file (robomimic) or folder (minari, lerobot)")
     parts.add_argument("--to", choices=TARGETS, required=True)
-    parts.add_argument("--fps", type=float, help="steps per second, where the source tells none")
+    parts.add_argument("--fps", type=float, help="steps per second, if not the source's")
     parts.set_defaults(run=convert_command)
     options = parser.parse_args(arguments)
     with exit_codes():

@@ -14,8 +14,9 @@ import numpy as np
 from torchrl_bmrl.data import lerobot, minari, robomimic
 from torchrl_bmrl.data.account import Account
 from torchrl_bmrl.data.episodes import Episode
-from torchrl_bmrl.data.schema import Layout, check_episode, layout_of
-from torchrl_bmrl.data.sources import Source, find_format, joined, open_source
+from torchrl_bmrl.data.options import ReadOptions
+from torchrl_bmrl.data.schema import Layout, check_episode, check_fps, layout_of
+from torchrl_bmrl.data.sources import Source, find_format, joined, open_source, with_joint_range
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
 
 __all__ = ["TARGETS", "Conversion", "convert", "find_format", "open_source"]
@@ -57,7 +58,7 @@ def convert(
         to: ``"robomimic"``, ``"minari"`` or ``"lerobot"``.
         task: whose scene a robosuite ``demo.hdf5`` was recorded in.
         tracking: see :func:`torchrl_bmrl.data.robosuite.open_episodes`.
-        fps: steps per second [Hz], for Minari and LeRobot; ``None`` for the source's own.
+        fps: steps per second [Hz]; ``None`` for the source's own.
         report: called with 1 after every episode.
         options: how sources are read, see :class:`~torchrl_bmrl.data.options.ReadOptions`.
 
@@ -91,16 +92,19 @@ def convert(
     given = [source] if isinstance(source, str | os.PathLike) else list(source)
     if not given:
         raise ConfigError("no source; valid: at least one")
+    if fps is not None:
+        check_fps(fps)
     target = Path(target).expanduser()
+    # Once: an iterator of keys is at its end after the first source.
+    options = vars(ReadOptions(**options))
     with ExitStack() as stack:
         sources = [
             stack.enter_context(open_source(Path(path), task=task, tracking=tracking, **options))
             for path in given
         ]
         for data in sources:
-            for key, message in data.problems:
-                raise DataError(data.path, key, message)
-        passing = _Passing(sources, report)
+            data.check()
+        passing = _Passing(with_joint_range(sources), report)
         try:
             if os.path.lexists(target):
                 raise DataError(target, None, "exists; valid: a new name")
@@ -126,7 +130,7 @@ class _Passing:
         self.account = Account()
         self.extras: dict[str, None] = {}
         self.attributes: dict[str, None] = {}
-        self.rounded = self.terminated = False
+        self.rounded = self.terminated = self.whole_numbers = False
 
     @property
     def names(self) -> list[str]:
@@ -167,6 +171,8 @@ class _Passing:
         self.terminated |= bool(np.any(episode.terminated))
         numbers = (episode.actions, episode.rewards, *episode.observations.values())
         self.rounded |= any(array.dtype.itemsize > 4 for array in numbers)
+        self.whole_numbers |= any(array.dtype.kind != "f" for array in numbers)
+        self.bounded = episode.actions.dtype.kind == "f"
 
     def notes(self, to: str) -> Iterator[str]:
         """What the new data set lacks, or has otherwise."""
@@ -185,6 +191,7 @@ class _Passing:
                 extras=list(self.extras),
                 attributes=list(self.attributes),
                 rounded=self.rounded,
+                whole_numbers=self.whole_numbers,
                 terminated=self.terminated,
             )
 
@@ -193,13 +200,19 @@ class _Passing:
         told = {str(source.metadata.get("env_args")) for source in self.sources}
         if len(told) > 1:
             yield f"env_args differ between the sources: those of {self.sources[0].path} are kept"
+        for mask in self.metadata["masks"]:
+            lacking = [x.path for x in self.sources if mask not in x.metadata.get("masks", {})]
+            if lacking:
+                yield f"mask {mask} has no episode of {lacking[0]}, which has no such mask"
         keys = [key for source in self.sources for key in source.metadata]
         if to != "robomimic":
-            placed = ("fps", "task", "masks", *(["action_bounds"] if to == "minari" else []))
+            bounds = ["action_bounds"] if to == "minari" and self.bounded else []
+            placed = ("fps", "task", "masks", *bounds)
             dropped = [key for key in keys if key not in placed]
             dropped += [f"mask {name}" for name in self.metadata["masks"]]
         else:
-            dropped = [key for key in keys if key not in self.metadata]
+            # Bounds are equal, however they are written.
+            dropped = [key for key in keys if key not in (*self.metadata, "action_bounds")]
         if dropped:
             names = ", ".join(dict.fromkeys(dropped))
             yield f"left out, as the data set has no place for it: {names}"
@@ -215,7 +228,7 @@ def _write(target: Path, to: str, passing: _Passing, fps: float | None) -> None:
             key: value
             for key, value in metadata.items()
             if key not in ("env_args", "masks", "total", "action_bounds")
-        }
+        } | ({} if fps is None else {"fps": fps})
         robomimic.write_episodes(
             target,
             passing,

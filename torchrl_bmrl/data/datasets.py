@@ -33,7 +33,7 @@ from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.files import new_folder
 from torchrl_bmrl.functional import mean_and_scale
 
-LAYOUT_VERSION = 2
+LAYOUT_VERSION = 3
 """Part of a cache's name: another version converts anew."""
 ATTEMPTS = 3
 """Conversions before a file system that gives back other data than were written is reported."""
@@ -277,6 +277,7 @@ def _convert(source: Path, target: Path, options: Mapping[str, Any], split_trajs
             if (form := find_format(source)) != "robomimic":
                 raise DataError(source, None, _other_format(source, form))
             with open_source(source, to_train=True, **options) as data_set:
+                data_set.check()
                 steps = count_steps(source, data_set.episodes)
                 data = _write_rows(folder / "data", data_set, steps)
                 data_set.account.check(source, data_set.options)

@@ -106,7 +106,12 @@ def write_episodes(
 
 
 def describe_losses(
-    *, extras: Iterable[str], attributes: Iterable[str], rounded: bool, terminated: bool
+    *,
+    extras: Iterable[str],
+    attributes: Iterable[str],
+    rounded: bool,
+    whole_numbers: bool,
+    terminated: bool,
 ) -> Iterator[str]:
     """What :func:`write_episodes` has no place for, in words.
 
@@ -114,6 +119,7 @@ def describe_losses(
         extras: names of the episodes' extras.
         attributes: names of their attributes.
         rounded: whether some numbers have more than 32 bits.
+        whole_numbers: whether actions, rewards or observations have some.
         terminated: whether some episodes terminate.
     """
     dropped = [*(name for name in extras if name != "successes"), *attributes]
@@ -121,6 +127,8 @@ def describe_losses(
     yield f"left out: the observation after the last step of each episode{named}"
     if rounded:
         yield "numbers of 64 bits are rounded to float32"
+    if whole_numbers:
+        yield "whole numbers become float32"
     if terminated:
         yield "terminations are kept as next.done alone: read them with dones_terminate"
 

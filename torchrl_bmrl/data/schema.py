@@ -390,7 +390,7 @@ def _warnings(summary: Summary, bounds: Bounds | None) -> Iterator[str]:
     actions = summary.ranges.get("actions")
     if actions is None or not actions.dtype.startswith("float"):
         return
-    share = np.atleast_1d(actions.saturated / max(1, steps))
+    share = np.ravel(actions.saturated / max(1, steps))
     # A dimension that is nowhere else has two commands, such as a gripper's.
     for i in np.flatnonzero((share > 0.5) & (share < 1)):
         yield f"actions: dimension {i} is at ±1 in {share[i]:.0%} of all steps"
