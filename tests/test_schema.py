@@ -190,6 +190,13 @@ def test_names_of_torchrl_s_layout_are_taken(name: str) -> None:
     assert "valid: none of" in found[f"obs/{name}"]
 
 
+@pytest.mark.parametrize("name", [".hidden", "a\\b", "n" * 300])
+def test_names_that_no_file_of_a_memory_map_can_have_are_refused(name: str) -> None:
+    found = problems(make_episode(parts={name: ((2,), np.float64)}))
+    assert list(found) == [f"obs/{name}"]
+    assert "without slashes" in found[f"obs/{name}"]
+
+
 LAYOUT = layout_of(make_episode())
 
 

@@ -134,6 +134,17 @@ class LazyEpisodes(Mapping[str, E], Generic[E]):
         return len(self._names)
 
 
+def name_fault(name: str) -> str | None:
+    """Why a part of the observation cannot have a name; ``None`` if it can."""
+    if name in RESERVED:
+        return f"a name that TorchRL's layout uses; valid: none of {sorted(RESERVED)}"
+    # Memory-mapped tensors have it for the name of their file, and it may come from a stranger.
+    length = len(name.encode(errors="surrogateescape"))
+    if not 0 < length <= 240 or name.startswith(".") or "/" in name or "\\" in name:
+        return "valid: a name of at most 240 bytes without slashes that does not begin with a dot"
+    return None
+
+
 def as_tensordict(episode: Episode, *, number: int = 0) -> TensorDict:
     """One episode in TorchRL's layout (TED).
 
@@ -166,16 +177,8 @@ def as_tensordict(episode: Episode, *, number: int = 0) -> TensorDict:
         [False, False, False, False, True]
     """
     for name in episode.observations:
-        if name in RESERVED:
-            raise BMRLError(
-                f"a part of the observation is named {name!r}; valid: none of {sorted(RESERVED)}"
-            )
-        # Memory-mapped tensors have it for the name of their file, and it may come from a stranger.
-        if not name or name.startswith(".") or "/" in name or "\\" in name:
-            raise BMRLError(
-                f"a part of the observation is named {name!r}; valid: a name without slashes that "
-                "does not begin with a dot"
-            )
+        if fault := name_fault(name):
+            raise BMRLError(f"a part of the observation is named {name!r}; {fault}")
     steps = len(episode)
     action = torch.as_tensor(episode.actions)
     terminated = torch.as_tensor(episode.terminated, dtype=torch.bool).unsqueeze(-1)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from torchrl_bmrl.data.account import Account
-from torchrl_bmrl.data.episodes import RESERVED, Episode
+from torchrl_bmrl.data.episodes import Episode, name_fault
 from torchrl_bmrl.data.options import Bounds, ReadOptions
 from torchrl_bmrl.errors import ConfigError, DataError
 
@@ -104,11 +104,8 @@ def find_problems(
         yield key, "missing, but other episodes have it"
     for name, part in episode.observations.items():
         after = episode.next_observations.get(name)
-        if name in RESERVED:
-            yield (
-                f"obs/{name}",
-                f"a name that TorchRL's layout uses; valid: none of {sorted(RESERVED)}",
-            )
+        if fault := name_fault(name):
+            yield f"obs/{name}", fault
         if after is None:
             yield f"next_obs/{name}", "missing"
         elif (part.shape, part.dtype) != (after.shape, after.dtype) and not (
