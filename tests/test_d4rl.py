@@ -343,6 +343,10 @@ def test_timeouts_whose_next_observation_is_the_next_episodes_are_said(path: Pat
         "without next_observations these steps are left out"
     ]
     assert list(read(path)) == NAMES
+    # No value is bootstrapped from behind a terminal.
+    arrays["terminals"][9] = True
+    write(path, arrays, next_observations=np.roll(arrays["observations"], -1, axis=0))
+    assert find_oddities(path)[2].startswith("at 1 of 1 timeouts, such as row 15, ")
 
 
 def test_a_row_that_is_terminal_and_timeout_terminates_and_is_said(path: Path) -> None:

@@ -176,7 +176,6 @@ def _end_oddities(
         )
     if flat.after:
         cut = flat.timeouts & ~flat.terminals
-        cut[-1] = False  # nothing follows
         wrong = np.flatnonzero(cut & ~find_jumps(path, file, flat))
         if len(wrong):
             yield (
