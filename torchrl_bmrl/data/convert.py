@@ -188,7 +188,6 @@ class _Passing:
                 terminated=self.terminated,
             )
 
-
     def _dropped(self, to: str) -> Iterator[str]:
         """What of the sources' metadata has no place in the new data set."""
         told = {str(source.metadata.get("env_args")) for source in self.sources}

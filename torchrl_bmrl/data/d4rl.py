@@ -21,7 +21,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from torchrl_bmrl.data.d4rl_layout import (
@@ -45,6 +44,10 @@ from torchrl_bmrl.data.hdf5 import (
 )
 from torchrl_bmrl.data.raw import RawEpisode
 from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.extras import needs
+
+with needs("data"):
+    import h5py
 
 
 def is_d4rl(path: str | Path, file: h5py.File) -> bool:

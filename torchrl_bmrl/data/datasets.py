@@ -109,6 +109,7 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
         >>> import tempfile
         >>> import numpy as np
         >>> from torchrl.data.datasets import load_dataset
+        >>> from torchrl_bmrl.data import Episode
         >>> from torchrl_bmrl.data.robomimic import write_episodes
         >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.zeros(5)
         >>> episode = Episode(

@@ -138,7 +138,7 @@ def open_raw(path: str | os.PathLike[str]) -> Iterator[Mapping[str, RawEpisode]]
 
 
 def read_metadata(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a data set says about itself: ``dataset_id``, ``fps``, and ``task`` where it has one.
+    """What a data set says about itself: ``dataset_id``, ``fps``, ``robot_type``, its one ``task``.
 
     Raises:
         DataError: as :func:`open_raw`.
@@ -148,6 +148,8 @@ def read_metadata(path: str | os.PathLike[str]) -> dict[str, Any]:
     fps = layout.info.get("fps")
     if isinstance(fps, int | float) and not isinstance(fps, bool) and 0 < fps < float("inf"):
         told["fps"] = float(fps)
+    if isinstance(robot := layout.info.get("robot_type"), str):
+        told["robot_type"] = robot
     tasks = {rows.task for rows in layout.episodes.values()}
     if len(tasks) == 1 and (task := tasks.pop()):
         told["task"] = task
