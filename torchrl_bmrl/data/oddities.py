@@ -182,10 +182,10 @@ def _longest(equal: np.ndarray, episode: Episode) -> tuple[int, int] | None:
 def _idle_steps(episode: Episode) -> int:
     """Steps at the end of an episode in which neither action nor observation changes, if many."""
     still = _equal_to_next(episode.actions)
+    # Those after one action at least: a first step cannot tell whether its action is new.
+    if not (steps := _trailing(still)):
+        return 0
     for key, part in episode.observations.items():
-        # Those after one action at least: a first step cannot tell whether its action is new.
-        if (steps := _trailing(still)) < FROZEN_STEPS:
-            return 0
         rows = np.append(part[-steps:], episode.next_observations[key][-1:], axis=0)
         low, high = (_numbers(extreme[None]) for extreme in (part.min(axis=0), part.max(axis=0)))
         moved = np.abs(np.diff(_numbers(rows), axis=0)) > AT_REST * (high - low)
