@@ -191,8 +191,9 @@ def test_numbers_that_do_not_fit_their_type_are_refused() -> None:
 
 
 def test_slices_never_join_two_data_sets() -> None:
-    storage = make_mixed_replay_buffer(files(), weights=[1, 1, 1], batch_size=4).storage
-    sampler = SliceSampler(slice_len=3, traj_key="episode", strict_length=True)
+    data = [part[part["episode"] == 2] for part in files()]  # one episode each
+    storage = make_mixed_replay_buffer(data, weights=[1, 1, 1], batch_size=4).storage
+    sampler = SliceSampler(slice_len=3, traj_key="episode")
     buffer = TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=30)
     seen = set()
     for _ in range(30):
@@ -280,6 +281,13 @@ INDICES = {
     "mask": torch.arange(47) > 40,
     "slice": slice(2, 5),
 }
+
+
+@every_buffer
+def test_what_is_added_to_all_rows_is_not_added_to_the_buffer(make: Make) -> None:
+    buffer = make()
+    buffer[:]["next", "other"] = torch.zeros(len(buffer))
+    assert "other" not in set(buffer[:]["next"].keys())
 
 
 @pytest.mark.parametrize("index", INDICES.values(), ids=list(INDICES))

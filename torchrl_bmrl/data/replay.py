@@ -14,10 +14,16 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
 
-from torchrl_bmrl.data.sampler import DatasetBuffer, Device, MemmapStorage, TaskSampler
+from torchrl_bmrl.data.sampler import (
+    DatasetBuffer,
+    Device,
+    DeviceStorage,
+    MemmapStorage,
+    TaskSampler,
+)
 from torchrl_bmrl.errors import BMRLError, ConfigError
 
 EPISODE_NUMBERS = tuple(
@@ -254,7 +260,7 @@ def _make_buffer(
     target = check_device(device)
     sizes = [len(data) for data in datasets]
     if target.type != "cpu" and fits(datasets, target):
-        storage = LazyTensorStorage(sum(sizes), device=target)
+        storage = DeviceStorage(sum(sizes), device=target)
     else:
         storage = MemmapStorage(sum(sizes), scratch_dir=scratch_dir)
     transferred = storage.device != target
