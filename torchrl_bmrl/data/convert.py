@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from torchrl_bmrl.data import lerobot, minari, robomimic
 from torchrl_bmrl.data.account import Account
 from torchrl_bmrl.data.episodes import Episode
@@ -126,7 +124,7 @@ class _Passing:
         self.account = Account()
         self.extras: dict[str, None] = {}
         self.attributes: dict[str, None] = {}
-        self.rounded = self.terminated = False
+        self.rounded = False
 
     @property
     def names(self) -> list[str]:
@@ -164,7 +162,6 @@ class _Passing:
         self.account.add(episode)
         self.extras |= dict.fromkeys(episode.extras)
         self.attributes |= dict.fromkeys(episode.attributes)
-        self.terminated |= bool(np.any(episode.terminated))
         numbers = (episode.actions, episode.rewards, *episode.observations.values())
         self.rounded |= any(array.dtype.itemsize > 4 for array in numbers)
 
@@ -185,7 +182,6 @@ class _Passing:
                 extras=list(self.extras),
                 attributes=list(self.attributes),
                 rounded=self.rounded,
-                terminated=self.terminated,
             )
 
     def _dropped(self, to: str) -> Iterator[str]:

@@ -34,7 +34,7 @@ _OLD, _NEW = ("v2.0", "v2.1"), ("v3.0",)
 _OLD_FILE = "data/chunk-{chunk:03d}/episode_{episode:06d}.parquet"
 _NEW_FILE = "data/chunk-{chunk:03d}/file-{file:03d}.parquet"
 _INDICES = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-_STEPS = ("next.reward", "next.done", "next.success")
+_STEPS = ("next.reward", "next.done", "next.success", "next.terminated")
 _SLACK = 1e-3
 """By how much a step's timestamp may be off, as a share of the time since the first: float32."""
 
@@ -57,15 +57,19 @@ class _Layout:
     path: Path
     info: Mapping[str, Any]
     episodes: Mapping[str, _Rows]
+    steps: Mapping[str, int]
 
     @classmethod
     def of(cls, path: str | os.PathLike[str]) -> _Layout:
         path = Path(path)
         info = _read_info(path)
         new = info["codebase_version"] in _NEW
-        listed = _read_table(path, "meta/episodes") if new else _read_lines(path, "episodes")
+        listed = (
+            _read_table(path, "meta/episodes") if new else _ordered(_read_lines(path, "episodes"))
+        )
         rows: dict[str, _Rows] = {}
         first_of_file: dict[str, int] = {}
+        steps_of_file: dict[str, int] = {}
         start = 0
         for i, row in enumerate(listed):
             where = f"row {i}"
@@ -88,9 +92,10 @@ class _Layout:
                     raise DataError(path, "meta/episodes", message)
                 name = _NEW_FILE.format(chunk=chunk, file=file)
             else:
-                chunk = i // _whole(path, info, "chunks_size", "info.json")
+                chunk = i // info.get("chunks_size", 1000)
                 name = _OLD_FILE.format(chunk=chunk, episode=i)
             first = first_of_file.setdefault(name, start)
+            steps_of_file[name] = steps_of_file.get(name, 0) + count
             tasks = row.get("tasks")
             tasks = tasks if isinstance(tasks, list) else [tasks]
             rows[f"episode_{i}"] = _Rows(
@@ -103,7 +108,11 @@ class _Layout:
             start += count
         if not rows:
             raise DataError(path, "meta/episodes", "no episodes; valid: at least one")
-        return cls(path=path, info=info, episodes=rows)
+        for stray in sorted((path / "data").rglob("*.parquet")):
+            # LeRobot would read its steps, too.
+            if str(stray.relative_to(path).as_posix()) not in steps_of_file:
+                raise DataError(stray, None, "in no episode; valid: a file that meta tells of")
+        return cls(path=path, info=info, episodes=rows, steps=steps_of_file)
 
 
 @contextmanager
@@ -112,9 +121,10 @@ def open_raw(path: str | os.PathLike[str]) -> Iterator[Mapping[str, RawEpisode]]
 
     Every column ``observation.<part>`` of numbers is a part. Where the features name each number
     ``<part>.<i>``, as this library writes ``observation.state``, those are the parts. ``action``,
-    ``next.reward``, ``next.done`` and ``next.success`` become actions, rewards, dones and the extra
-    ``successes``; other columns of numbers are extras, and the task's text is the attribute
-    ``task``. Images, videos and texts are named in ``left_alone``.
+    ``next.reward``, ``next.done``, ``next.terminated`` and ``next.success`` become actions,
+    rewards, dones, terminations and the extra ``successes``; other columns of numbers are extras,
+    and the task's text is the attribute ``task``. Images, videos and texts are named in
+    ``left_alone``.
 
     Args:
         path: the data set's folder, which holds ``meta/info.json``.
@@ -194,6 +204,12 @@ def _read_info(path: Path) -> dict[str, Any]:
         raise DataError(file, "codebase_version", message)
     if not isinstance(info.get("features"), dict):
         raise DataError(file, "features", "missing; valid: a JSON object")
+    fps, chunks_size = info.get("fps"), info.get("chunks_size", 1000)
+    # bool is an int in Python; a larger number is no rate, and may be no float.
+    if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 < fps < 1e9:
+        raise DataError(file, "fps", f"{fps!r}; valid: a positive number")
+    if not isinstance(chunks_size, int) or isinstance(chunks_size, bool) or chunks_size < 1:
+        raise DataError(file, "chunks_size", f"{chunks_size!r}; valid: 1 or more")
     return info
 
 
@@ -219,7 +235,9 @@ def _read_lines(path: Path, name: str) -> list[dict[str, Any]]:
     _refuse_pointer(file)
     rows = []
     try:
-        for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
+        # Not splitlines: a text may hold other ends of lines, such as U+2028.
+        lines = file.read_text(encoding="utf-8").split("\n")
+        for number, line in enumerate(lines, 1):  # no other ends
             row = json.loads(line) if line.strip() else None
             if not isinstance(row, dict | None):
                 raise DataError(file, f"line {number}", "valid: a JSON object")
@@ -243,6 +261,10 @@ def _read_table(path: Path, name: str) -> list[dict[str, Any]]:
                 key for key in parquet.schema_arrow.names if key in keys or key.startswith("data/")
             ]
             rows += parquet.read(columns=present).to_pylist()
+    return _ordered(rows)
+
+
+def _ordered(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: (str(type(row.get("episode_index"))), _order(row)))
 
 
@@ -285,16 +307,32 @@ class _Tables:
         if name != self.name:
             with _opened(self.layout.path / name) as parquet:
                 fields = {field.name: field.type for field in parquet.schema_arrow}
+                self._check(self.layout.path / name, parquet, fields)
                 numbers = [key for key, kind in fields.items() if _holds_numbers(kind)]
                 self.table = parquet.read(columns=numbers)
             self.left_alone = [key for key in fields if key not in numbers]
             self.name = name
         return self.table
 
+    def _check(self, file: Path, parquet: Any, fields: Mapping[str, Any]) -> None:
+        rows = parquet.metadata.num_rows
+        valid = self.layout.steps[file.relative_to(self.layout.path).as_posix()]
+        if rows != valid:
+            raise DataError(file, None, f"{rows} rows; valid: {valid}, as meta/episodes says")
+        for key in parquet.schema_arrow.names:
+            if parquet.schema_arrow.names.count(key) > 1:
+                raise DataError(file, key, "several columns of this name; valid: one")
+        for key, feature in self.layout.info["features"].items():
+            told = feature.get("dtype") if isinstance(feature, dict) else None
+            if told != "video" and key not in fields:
+                raise DataError(file, key, "missing, but meta/info.json tells of it")
+
 
 def _holds_numbers(kind: Any) -> bool:
     with needs("data"):
         import pyarrow as pa
+    # datasets' arrays of several dimensions, once that package is imported.
+    kind = kind.storage_type if isinstance(kind, pa.BaseExtensionType) else kind
     while (
         pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
     ):
@@ -306,9 +344,6 @@ def _read_episode(layout: _Layout, name: str, tables: _Tables) -> RawEpisode:
     rows = layout.episodes[name]
     file = layout.path / rows.file
     table = tables.read(rows.file)
-    if rows.start + rows.count > len(table):
-        message = f"{len(table)} rows; valid: {rows.start + rows.count}, as meta/episodes says"
-        raise DataError(file, None, message)
     part = table.slice(rows.start, rows.count)
     arrays = {key: _array(file, key, part[key], rows.start) for key in part.column_names}
     number = int(name.rpartition("_")[2])
@@ -328,7 +363,7 @@ def _read_episode(layout: _Layout, name: str, tables: _Tables) -> RawEpisode:
     extras = {key: array for key, array in arrays.items() if key not in known}
     flags = {
         key: _flags(file, key, steps[key], rows.start)
-        for key in ("next.done", "next.success")
+        for key in ("next.done", "next.success", "next.terminated")
         if key in steps
     }
     if "next.success" in flags:
@@ -338,6 +373,7 @@ def _read_episode(layout: _Layout, name: str, tables: _Tables) -> RawEpisode:
         actions=_column(arrays["action"]),
         rewards=steps.get("next.reward"),
         dones=flags.get("next.done"),
+        terminated=flags.get("next.terminated"),
         extras=extras,
         attributes={"task": rows.task} if rows.task else {},
         left_alone=tuple(tables.left_alone),
@@ -352,6 +388,8 @@ def _array(file: Path, key: str, column: Any, start: int) -> np.ndarray:
     array = column.combine_chunks()
     if isinstance(array, pa.ChunkedArray):
         array = pa.concat_arrays(array.chunks)
+    if isinstance(array.type, pa.BaseExtensionType):
+        array = array.storage
     shape = [len(array)]
     while True:
         if array.null_count:
@@ -367,7 +405,8 @@ def _array(file: Path, key: str, column: Any, start: int) -> np.ndarray:
             raise DataError(file, key, message)
         shape.append(int(sizes[0]))
         array = array.flatten()
-    return array.to_numpy(zero_copy_only=False).reshape(shape)
+    # A copy: pyarrow's memory is read only, and the file's other episodes lie beside it.
+    return array.to_numpy(zero_copy_only=False).reshape(shape).copy()
 
 
 def _check_indices(
