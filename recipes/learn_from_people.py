@@ -135,7 +135,9 @@ def learn_from_people(config: Config) -> None:
         raw = find_format(Path(config.human.path)) == "robosuite"
         options = {"task": TASK, "tracking": config.human.tracking} if raw else {}
         with progress(None, "converting", "episode") as bar:
-            convert(config.human.path, human, to="robomimic", report=bar.update, **options)
+            done = convert(config.human.path, human, to="robomimic", report=bar.update, **options)
+        for note in done.notes:
+            print(f"warning: {config.human.path}: {note}")
     collect(config)
     agents = [
         (config, share, seed)

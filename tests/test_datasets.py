@@ -35,7 +35,7 @@ from episode_files import (
 from tensordict import TensorDict
 from torchrl.data import SliceSampler
 from torchrl.data.datasets import load_dataset
-from torchrl.envs.transforms import CatTensors, Compose, Transform
+from torchrl.envs.transforms import CatTensors, Compose, ObservationNorm, Transform
 
 from torchrl_bmrl.data import datasets
 from torchrl_bmrl.data.datasets import RobomimicExperienceReplay
@@ -240,6 +240,22 @@ def test_a_transform_applies_to_samples(path: Path) -> None:
     sample = replay.sample()
     assert sample["observation"].shape == sample["next", "observation"].shape == (6, 10)
     assert "object" not in set(sample.keys())
+
+
+@pytest.mark.parametrize("index", [slice(None), ..., slice(0, None)])
+def test_a_transform_of_all_rows_leaves_the_stored_ones_as_they_are(path: Path, index: Any) -> None:
+    """TorchRL's own storages hand out their tensordict: each call would normalise once more."""
+    loc, scale = torch.tensor(1.0), torch.tensor(2.0)
+    keys = ["object", ("next", "object")]
+    transform = ObservationNorm(loc=loc, scale=scale, in_keys=keys, standard_normal=True)
+    replay = RobomimicExperienceReplay(path, transform=transform)
+    expected = (whole(made(), "observations", "object") - 1) / 2
+    for _ in range(2):
+        assert torch.equal(replay[index]["object"], expected)
+        assert torch.equal(replay[index]["next", "object"][:1], replay[:1]["next", "object"])
+    assert torch.equal(replay[0]["object"], expected[0])
+    replay[index]["next", "other"] = torch.zeros(TOTAL)
+    assert "other" not in set(replay[index]["next"].keys())
 
 
 def test_the_buffer_refuses_to_be_written_to(path: Path) -> None:
@@ -853,8 +869,12 @@ def convert_together(path: str, root: str, barrier: Any, results: Any) -> None:
     results.put((str(replay.data_path), replay[:]["object"].sum().item()))
 
 
-def test_two_processes_may_convert_at_once(path: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("damaged", [False, True])
+def test_two_processes_may_convert_at_once(path: Path, tmp_path: Path, damaged: bool) -> None:
     root = tmp_path / "root"
+    if damaged:
+        folder = RobomimicExperienceReplay(path, root=root).data_path
+        os.truncate(folder / "data" / "object.memmap", 16)
     barrier, results = SPAWN.Barrier(2), SPAWN.Queue()
     args = (str(path), str(root), barrier, results)
     processes = [SPAWN.Process(target=convert_together, args=args) for _ in range(2)]

@@ -243,6 +243,15 @@ def test_a_run_lies_in_the_folder_that_was_typed(
     assert read_settings(tmp_path / typed)["run_dir"] == typed
 
 
+def test_a_folder_whose_name_is_a_number_knows_its_settings_too(
+    recipes: Any, made: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(made.rename(made.with_name("1.10")).parent)
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    code, (config,) = started(recipes, "evaluate", "run_dir=1.10")
+    assert (code, config.seed, config.run_dir) == (0, 3, "1.10")
+
+
 @pytest.mark.parametrize("name", ["", "null", "[1.10]", "{a:1}", "1.10,2.0"])
 def test_what_is_no_folder_is_refused(
     recipes: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, capsys: Any

@@ -177,9 +177,8 @@ def test_a_file_of_each_layout_goes_to_each_format_and_back_or_the_loss_is_named
     done = convert(source, target, to=to, fps=20, **options)
     back = tmp_path / "back.hdf5"
     further: dict[str, Any] = {}
-    if to == "lerobot":  # which has no place for terminations either, but for dones
-        further = {key: options[key] for key in options if key == "dones_terminate"}
-        further = further or {"last_step": "truncate"}
+    if to == "lerobot":  # a step that terminates is kept in any case
+        further = {"last_step": "truncate"}
     convert(target, back, to="robomimic", **further)
     data = load(back)
     part = "observation" if layout == "D4RL" else "x"
@@ -202,7 +201,7 @@ def test_a_file_of_each_layout_goes_to_each_format_and_back_or_the_loss_is_named
         assert "left alone in the episodes: initial_state (3x), states (3x)" in notes
     if layout == "LIBERO" and to == "lerobot":
         assert "robot_states" in notes
-        assert "terminations" in notes
+        assert "terminations" not in notes  # they come back
 
 
 def test_dtypes_survive_where_the_format_has_them(tmp_path: Path) -> None:

@@ -84,6 +84,7 @@ def expected_columns() -> dict[str, np.ndarray]:
         "next.reward": np.concatenate([e.rewards for e in episodes]).astype(np.float32),
         "next.success": np.concatenate([e.extras["successes"] for e in episodes]),
         "next.done": np.concatenate([np.arange(steps) == steps - 1 for steps in LENGTHS]),
+        "next.terminated": np.zeros(sum(LENGTHS), bool),
         "timestamp": np.concatenate([np.arange(steps) / FPS for steps in LENGTHS]).astype("f4"),
         "frame_index": np.concatenate([np.arange(steps) for steps in LENGTHS]),
         "episode_index": np.repeat(np.arange(len(LENGTHS)), LENGTHS),

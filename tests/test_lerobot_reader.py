@@ -370,3 +370,140 @@ def test_every_mutated_set_is_refused_by_name_or_accounts_for_every_step(tmp_pat
                 expected = made.get(f"observation.{part.removesuffix('_')}")
                 np.testing.assert_array_equal(array, np.float32(expected)[:-1])
     assert min(outcomes["read"], outcomes["refused"]) > 60, outcomes
+
+
+# -- what LeRobot itself writes or takes -----------------------------------------------------------
+
+
+def edit_info(path: Path, **changes: Any) -> None:
+    file = path / "meta" / "info.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
+
+
+def edit_data(path: Path, name: str, edit: Callable[[pa.Table], pa.Table]) -> None:
+    pq.write_table(edit(pq.read_table(path / name)), path / name)
+
+
+def test_terminations_and_horizons_of_one_set_come_back_apart(tmp_path: Path) -> None:
+    made = [make_episode(i, 5, parts=PARTS, terminated=i == 1) for i in range(3)]
+    lerobot.write_episodes(tmp_path / "set", made, fps=FPS, task="lift")
+    for dones_terminate in (False, True):
+        options = {"dones_terminate": dones_terminate, "last_step": "truncate"}
+        with open_source(tmp_path / "set", **options) as source:
+            ends = [bool(source.episodes[name].terminated[-1]) for name in source.episodes]
+        assert ends == [False, True, False]
+
+
+def test_arrays_of_several_dimensions_are_read_with_datasets_imported(tmp_path: Path) -> None:
+    datasets = pytest.importorskip("datasets")
+    path = write(tmp_path / "set", "v2.1")
+    edit_info(path, features={"observation.grid": {"dtype": "float32", "shape": [2, 3]}})
+    for i, steps in enumerate(LENGTHS):
+        features = datasets.Features({"observation.grid": datasets.Array2D((2, 3), "float32")})
+        grid = np.full((steps, 2, 3), i, "f4")
+        made = datasets.Dataset.from_dict({"observation.grid": grid.tolist()}, features=features)
+        column = made.data.table["observation.grid"]
+        name = f"data/chunk-{i // 2:03d}/episode_{i:06d}.parquet"
+        edit_data(path, name, lambda t, c=column: t.append_column("observation.grid", c))
+    with open_raw(path) as episodes:
+        assert episodes["episode_1"].observations["grid"].tolist() == [[[1] * 3] * 2] * LENGTHS[1]
+
+
+class SeveralDimensions(pa.ExtensionType):  # type: ignore[misc]
+    """As datasets registers one."""
+
+    def __init__(self) -> None:
+        super().__init__(pa.list_(pa.list_(pa.float32())), "test.several_dimensions")
+
+    def __arrow_ext_serialize__(self) -> bytes:
+        return b""
+
+    @classmethod
+    def __arrow_ext_deserialize__(cls, storage: Any, serialized: bytes) -> SeveralDimensions:
+        return cls()
+
+
+def test_arrays_under_a_type_of_another_package_are_read(tmp_path: Path) -> None:
+    path = write(tmp_path / "set", "v2.1")
+    kind = SeveralDimensions()
+    pa.register_extension_type(kind)
+    try:
+        for i, steps in enumerate(LENGTHS):
+            storage = pa.array([[[i, 1], [2, 3]]] * steps, kind.storage_type)
+            column = pa.ExtensionArray.from_storage(kind, storage)
+            name = f"data/chunk-{i // 2:03d}/episode_{i:06d}.parquet"
+            edit_data(path, name, lambda t, c=column: t.append_column("observation.grid", c))
+        with open_raw(path) as episodes:
+            episode = episodes["episode_2"]
+    finally:
+        pa.unregister_extension_type("test.several_dimensions")
+    assert episode.observations["grid"].tolist() == [[[2, 1], [2, 3]]] * LENGTHS[2]
+    assert "observation.grid" not in episode.left_alone
+
+
+def test_numbers_can_be_written_to(tmp_path: Path) -> None:
+    with open_raw(write(tmp_path / "set", "v3.0")) as episodes:
+        assert episodes["episode_0"].actions.flags.writeable
+
+
+def test_lines_in_any_order_and_with_any_text_are_read(tmp_path: Path) -> None:
+    path = write(tmp_path / "set", "v2.1")
+    file = path / "meta" / "episodes.jsonl"
+    rows = [json.loads(line) for line in file.read_text().splitlines()]
+    rows = [{**row, "tasks": ["pick\u2028place"]} for row in reversed(rows)]
+    file.write_text("\n".join(json.dumps(row, ensure_ascii=False) for row in rows), "utf-8")
+    with open_raw(path) as episodes:
+        assert [len(episodes[name].actions) for name in episodes] == list(LENGTHS)
+        assert episodes["episode_0"].attributes["task"] == "pick\u2028place"
+
+
+FIRST = {"v2.1": "data/chunk-000/episode_000000.parquet", "v3.0": "data/chunk-000/file-000.parquet"}
+
+
+@pytest.mark.parametrize("version", FIRST)
+def test_no_step_of_a_data_file_vanishes(tmp_path: Path, version: str) -> None:
+    path = write(tmp_path / "set", version)
+    edit_data(path, FIRST[version], lambda table: pa.concat_tables([table, table.slice(0, 2)]))
+    with open_raw(path) as episodes, pytest.raises(DataError, match=r"\d rows; valid: \d"):
+        episodes["episode_0"]
+
+
+@pytest.mark.parametrize("version", FIRST)
+def test_a_data_file_of_no_episode_is_refused(tmp_path: Path, version: str) -> None:
+    path = write(tmp_path / "set", version)
+    stray = path / "data" / "chunk-000" / "file-077.parquet"
+    stray.write_bytes((path / FIRST[version]).read_bytes())
+    with pytest.raises(DataError, match=r"file-077\.parquet: in no episode"), open_raw(path):
+        pass
+
+
+def test_a_column_that_the_description_tells_of_is_missed(tmp_path: Path) -> None:
+    path = write(tmp_path / "set", "v2.1")
+    edit_info(path, features={"next.reward": {"dtype": "float32", "shape": [1], "names": None}})
+    edit_data(path, FIRST["v2.1"], lambda table: table.drop_columns(["next.reward"]))
+    with open_raw(path) as episodes, pytest.raises(DataError, match=r"next\.reward: missing"):
+        episodes["episode_0"]
+
+
+def test_two_columns_of_one_name_are_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "set", "v2.1")
+    edit_data(path, FIRST["v2.1"], lambda table: table.append_column("effort", table["effort"]))
+    with open_raw(path) as episodes, pytest.raises(DataError, match="effort: several columns"):
+        episodes["episode_0"]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        pytest.param("fps", 10**400, id="huge"),
+        ("fps", True),
+        ("fps", 0),
+        ("fps", "10"),
+        ("chunks_size", 0),
+    ],
+)
+def test_numbers_that_mean_nothing_are_named(tmp_path: Path, key: str, value: Any) -> None:
+    path = write(tmp_path / "set", "v2.1")
+    edit_info(path, **{key: value})
+    with pytest.raises(DataError, match=f"{key}: .*valid"), open_raw(path):
+        pass

@@ -770,35 +770,32 @@ def test_a_hole_in_the_file_is_found(path: Path) -> None:
         read(path)
 
 
+def layout_version(content: bytes, address: int) -> int:
+    """Version of the layout message of a dataset, whose header is there, as HDF5 specifies it."""
+    assert content[address : address + 5] == b"OHDR\x02"
+    flags = content[address + 5]
+    place = address + 6 + 16 * bool(flags & 32) + 4 * bool(flags & 16)
+    width = 1 << (flags & 3)
+    stop = place + width + int.from_bytes(content[place : place + width], "little")
+    place += width
+    while place < stop:
+        kind, size = content[place], int.from_bytes(content[place + 1 : place + 3], "little")
+        place += 4 + 2 * bool(flags & 4)
+        if kind == 8:
+            return content[place]
+        place += size
+    raise AssertionError("no layout message")
+
+
 def test_files_are_written_as_older_versions_of_hdf5_read_them(path: Path) -> None:
-    # Superblock 3 is of HDF5 1.10, and layouts of datasets are of version 4: see the message "bad
-    # version number for layout message" that newer ones meet in libraries before HDF5 2.
-    content = (path / "data" / "main_data.hdf5").read_bytes()
-    assert content[:9] == b"\x89HDF\r\n\x1a\n\x03"
-    with h5py.File(path / "data" / "main_data.hdf5") as file:
-        assert file["episode_0/actions"].compression == "gzip"
-        assert file["episode_0/actions"].fletcher32
-
-
-def test_a_flipped_bit_never_becomes_another_number(root: Path) -> None:
-    # Strings of any length have no checksums in HDF5: attributes are numbers here.
-    made = [with_parts(episode, attributes={"seed": 3}) for episode in make_episodes()]
-    write_episodes(root / ID, made)
-    file = root / ID / "data" / "main_data.hdf5"
-    whole = file.read_bytes()
-    refused = 0
-    for place in np.linspace(0, len(whole) - 1, 60).astype(int):
-        flipped = bytearray(whole)
-        flipped[place] ^= 16
-        file.write_bytes(flipped)
-        try:
-            episodes = read(root / ID)
-        except DataError:
-            refused += 1
-            continue
-        for ours, theirs in zip(episodes, made, strict=True):
-            assert_same_episodes(ours, theirs)
-    assert refused > 40
+    # HDF5 1.10 to 1.14 know versions up to 4, and call 5 a "bad version number for layout message".
+    file = path / "data" / "main_data.hdf5"
+    versions = set()
+    with h5py.File(file) as opened:
+        for key in ("actions", "observations/wrist", "infos/success"):
+            info = h5py.h5o.get_info(opened[f"episode_1/{key}"].id)
+            versions.add(layout_version(file.read_bytes(), info.addr))
+    assert versions == {4}
 
 
 # -- what is beside, and what contradicts ----------------------------------------------------------

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from torchrl_bmrl.data import lerobot, minari, robomimic
 from torchrl_bmrl.data.account import Account
 from torchrl_bmrl.data.episodes import Episode
@@ -130,7 +128,7 @@ class _Passing:
         self.account = Account()
         self.extras: dict[str, None] = {}
         self.attributes: dict[str, None] = {}
-        self.rounded = self.terminated = self.whole_numbers = False
+        self.rounded = self.whole_numbers = False
 
     @property
     def names(self) -> list[str]:
@@ -168,7 +166,6 @@ class _Passing:
         self.account.add(episode)
         self.extras |= dict.fromkeys(episode.extras)
         self.attributes |= dict.fromkeys(episode.attributes)
-        self.terminated |= bool(np.any(episode.terminated))
         numbers = (episode.actions, episode.rewards, *episode.observations.values())
         self.rounded |= any(array.dtype.itemsize > 4 for array in numbers)
         self.whole_numbers |= any(array.dtype.kind != "f" for array in numbers)
@@ -192,7 +189,6 @@ class _Passing:
                 attributes=list(self.attributes),
                 rounded=self.rounded,
                 whole_numbers=self.whole_numbers,
-                terminated=self.terminated,
             )
 
     def _dropped(self, to: str) -> Iterator[str]:

@@ -21,7 +21,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from torchrl_bmrl.data.d4rl_layout import (
@@ -45,6 +44,10 @@ from torchrl_bmrl.data.hdf5 import (
     read_strings,
 )
 from torchrl_bmrl.data.raw import RawEpisode
+from torchrl_bmrl.extras import needs
+
+with needs("data"):
+    import h5py
 
 
 def is_d4rl(path: str | Path, file: h5py.File) -> bool:
@@ -97,11 +100,16 @@ def open_raw(path: str | Path, *, horizon: int | None = None) -> Iterator[Mappin
     with open_file(path) as file:
         flat = Flat.of(path, file, horizon)
         names = {f"rows_{rows.start}_to_{rows.stop - 1}": rows for rows in flat.episodes()}
+        # HDF5 forgets what it has decompressed of an array when the last who has it open closes it,
+        # and the next episode lies in the same chunk.
+        keys = ["actions", "rewards", *flat.parts.values(), *flat.after.values()]
+        opened = [read_node(path, file, key) for key in [*keys, *flat.extras.values()]]
 
         def read(name: str) -> RawEpisode:
             return _read_episode(path, file, flat, names[name])
 
         yield LazyEpisodes(names, read)
+        del opened
 
 
 def read_metadata(path: str | Path) -> dict[str, Any]:
@@ -171,7 +179,6 @@ def _end_oddities(
         )
     if flat.after:
         cut = flat.timeouts & ~flat.terminals
-        cut[-1] = False  # nothing follows
         wrong = np.flatnonzero(cut & ~find_jumps(path, file, flat))
         if len(wrong):
             yield (

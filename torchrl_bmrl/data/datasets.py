@@ -26,7 +26,7 @@ from torchrl.envs.transforms import Transform
 from torchrl_bmrl.data.episodes import as_tensordict
 from torchrl_bmrl.data.options import Bounds, LastStep, ReadOptions, Reward
 from torchrl_bmrl.data.robomimic import count_steps
-from torchrl_bmrl.data.sampler import read_memmap
+from torchrl_bmrl.data.sampler import HandsOutCopies, read_memmap
 from torchrl_bmrl.data.schema import check_episode, layout_of
 from torchrl_bmrl.data.sources import Source, find_format, open_source
 from torchrl_bmrl.errors import BMRLError, DataError
@@ -39,7 +39,7 @@ ATTEMPTS = 3
 """Conversions before a file system that gives back other data than were written is reported."""
 
 
-class FixedStorage(TensorStorage):
+class FixedStorage(HandsOutCopies, TensorStorage):
     """Data that belong to a file: nothing writes to them, and a dump leaves them where they are."""
 
     def set(self, *args: Any, **kwargs: Any) -> None:
@@ -109,6 +109,7 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
         >>> import tempfile
         >>> import numpy as np
         >>> from torchrl.data.datasets import load_dataset
+        >>> from torchrl_bmrl.data import Episode
         >>> from torchrl_bmrl.data.robomimic import write_episodes
         >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.zeros(5)
         >>> episode = Episode(

@@ -137,11 +137,11 @@ class LazyEpisodes(Mapping[str, E], Generic[E]):
 def name_fault(name: str) -> str | None:
     """Why a part of the observation cannot have a name; ``None`` if it can."""
     if name in RESERVED:
-        return f"a name that TorchRL's layout uses; valid: none of {sorted(RESERVED)}"
+        return f"valid: none of {sorted(RESERVED)}, which TorchRL's layout uses"
     # Memory-mapped tensors have it for the name of their file, and it may come from a stranger.
     length = len(name.encode(errors="surrogateescape"))
     if not 0 < length <= 240 or name.startswith(".") or "/" in name or "\\" in name:
-        return "valid: a name of at most 240 bytes without slashes that does not begin with a dot"
+        return "valid: a name without slashes that does not begin with a dot, of at most 240 bytes"
     return None
 
 

@@ -60,7 +60,7 @@ def read_names(path: str | Path, file: h5py.File, key: str) -> list[str]:
 
 
 def read_node(path: str | Path, file: h5py.File, key: str) -> Any:
-    """A group or dataset; ``None`` where there is none.
+    """A group or dataset; ``None`` where there is none, or a link to nowhere.
 
     Raises:
         DataError: if it cannot be read, or lies in another file.
@@ -77,9 +77,13 @@ def _within(path: str | Path, file: h5py.File, key: str) -> Any:
     """A node of a file, whose content is in that file and no larger than it can be.
 
     Raises:
-        DataError: if it lies in another file, or claims more than compression makes of this one.
+        DataError: if it is damaged, lies in another file, or claims more than compression makes of
+            this one.
     """
     node = file.get(key)
+    # h5py has the same answer for what is not there and for what it cannot open.
+    if node is None and isinstance(file.get(key, getlink=True), h5py.HardLink):
+        raise DataError(path, key, "unreadable: it is there, and damaged")
     if node is not None and node.file.id != file.id:
         raise DataError(path, key, f"lies in {node.file.filename}; valid: in this file")
     if isinstance(node, h5py.Dataset):

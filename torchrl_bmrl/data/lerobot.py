@@ -48,8 +48,9 @@ def write_episodes(
 
     ``LeRobotDataset(repo_id, root=path)`` reads it. The columns, each with T rows for an episode:
     ``observation.state`` (the parts in their order, one after the other), ``action``,
-    ``next.reward``, ``next.done`` (the last step), ``next.success`` where there are ``successes``,
-    ``timestamp`` [s] and the indices. Other extras and the attributes are left out.
+    ``next.reward``, ``next.done`` (the last step), ``next.terminated``, ``next.success`` where
+    there are ``successes``, ``timestamp`` [s] and the indices. Other extras and the attributes
+    are left out.
 
     Args:
         path: the new folder.
@@ -106,12 +107,7 @@ def write_episodes(
 
 
 def describe_losses(
-    *,
-    extras: Iterable[str],
-    attributes: Iterable[str],
-    rounded: bool,
-    whole_numbers: bool,
-    terminated: bool,
+    *, extras: Iterable[str], attributes: Iterable[str], rounded: bool, whole_numbers: bool
 ) -> Iterator[str]:
     """What :func:`write_episodes` has no place for, in words.
 
@@ -120,7 +116,6 @@ def describe_losses(
         attributes: names of their attributes.
         rounded: whether some numbers have more than 32 bits.
         whole_numbers: whether actions, rewards or observations have some.
-        terminated: whether some episodes terminate.
     """
     dropped = [*(name for name in extras if name != "successes"), *attributes]
     named = f"; {', '.join(dropped)}" if dropped else ""
@@ -129,8 +124,6 @@ def describe_losses(
         yield "numbers of 64 bits are rounded to float32"
     if whole_numbers:
         yield "whole numbers become float32"
-    if terminated:
-        yield "terminations are kept as next.done alone: read them with dones_terminate"
 
 
 def _columns(path: Path, name: str, episode: Episode) -> dict[str, np.ndarray]:
@@ -148,6 +141,8 @@ def _columns(path: Path, name: str, episode: Episode) -> dict[str, np.ndarray]:
         "action": episode.actions.reshape(steps, -1).astype(np.float32),
         "next.reward": episode.rewards.astype(np.float32),
         "next.done": np.arange(steps) == steps - 1,
+        # A feature of its own, which LeRobot loads; next.done says nothing of the value after it.
+        "next.terminated": episode.terminated.astype(bool),
     }
     if "successes" in episode.extras:
         columns["next.success"] = episode.extras["successes"].astype(bool)

@@ -13,12 +13,10 @@ the layout.
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,85 +24,15 @@ import numpy as np
 
 from torchrl_bmrl.data.episodes import LazyEpisodes
 from torchrl_bmrl.data.hdf5 import check_finite
+from torchrl_bmrl.data.lerobot_meta import Layout, Rows, open_parquet
 from torchrl_bmrl.data.raw import RawEpisode
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.extras import needs
-from torchrl_bmrl.files import read_json
 
-_OLD, _NEW = ("v2.0", "v2.1"), ("v3.0",)
-_OLD_FILE = "data/chunk-{chunk:03d}/episode_{episode:06d}.parquet"
-_NEW_FILE = "data/chunk-{chunk:03d}/file-{file:03d}.parquet"
 _INDICES = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-_STEPS = ("next.reward", "next.done", "next.success")
+_STEPS = ("next.reward", "next.done", "next.success", "next.terminated")
 _SLACK = 1e-3
 """By how much a step's timestamp may be off, as a share of the time since the first: float32."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Rows:
-    """Where an episode lies: its file, its first row there, its rows, and its place in the set."""
-
-    file: str
-    start: int
-    count: int
-    index: int
-    task: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Layout:
-    """What the folder ``meta`` says of a data set."""
-
-    path: Path
-    info: Mapping[str, Any]
-    episodes: Mapping[str, _Rows]
-
-    @classmethod
-    def of(cls, path: str | os.PathLike[str]) -> _Layout:
-        path = Path(path)
-        info = _read_info(path)
-        new = info["codebase_version"] in _NEW
-        listed = _read_table(path, "meta/episodes") if new else _read_lines(path, "episodes")
-        rows: dict[str, _Rows] = {}
-        first_of_file: dict[str, int] = {}
-        start = 0
-        for i, row in enumerate(listed):
-            where = f"row {i}"
-            number, count = (_whole(path, row, key, where) for key in ("episode_index", "length"))
-            if number != i or count < 1:
-                message = f"{where}: episode_index {number}, length {count}; valid: {i}, 1 or more"
-                raise DataError(path, "meta/episodes", message)
-            if new:
-                chunk, file, begin, end = (
-                    _whole(path, row, key, where)
-                    for key in (
-                        "data/chunk_index",
-                        "data/file_index",
-                        "dataset_from_index",
-                        "dataset_to_index",
-                    )
-                )
-                if (begin, end) != (start, start + count):
-                    message = f"{where}: rows {begin} to {end}; valid: {start} to {start + count}"
-                    raise DataError(path, "meta/episodes", message)
-                name = _NEW_FILE.format(chunk=chunk, file=file)
-            else:
-                chunk = i // _whole(path, info, "chunks_size", "info.json")
-                name = _OLD_FILE.format(chunk=chunk, episode=i)
-            first = first_of_file.setdefault(name, start)
-            tasks = row.get("tasks")
-            tasks = tasks if isinstance(tasks, list) else [tasks]
-            rows[f"episode_{i}"] = _Rows(
-                file=name,
-                start=start - first,
-                count=count,
-                index=start,
-                task=", ".join(str(task) for task in tasks if task is not None),
-            )
-            start += count
-        if not rows:
-            raise DataError(path, "meta/episodes", "no episodes; valid: at least one")
-        return cls(path=path, info=info, episodes=rows)
 
 
 @contextmanager
@@ -113,9 +41,10 @@ def open_raw(path: str | os.PathLike[str]) -> Iterator[Mapping[str, RawEpisode]]
 
     Every column ``observation.<part>`` of numbers is a part. Where the features name each number
     ``<part>.<i>``, as this library writes ``observation.state``, those are the parts. ``action``,
-    ``next.reward``, ``next.done`` and ``next.success`` become actions, rewards, dones and the extra
-    ``successes``; other columns of numbers are extras, and the task's text is the attribute
-    ``task``. Images, videos and texts are named in ``left_alone``.
+    ``next.reward``, ``next.done``, ``next.terminated`` and ``next.success`` become actions,
+    rewards, dones, terminations and the extra ``successes``; other columns of numbers are extras,
+    and the task's text is the attribute ``task``. Images, videos and texts are named in
+    ``left_alone``.
 
     Args:
         path: the data set's folder, which holds ``meta/info.json``.
@@ -129,7 +58,7 @@ def open_raw(path: str | os.PathLike[str]) -> Iterator[Mapping[str, RawEpisode]]
             concerns one episode is raised when that is read.
         MissingExtraError: if pyarrow is not installed.
     """
-    layout = _Layout.of(path)
+    layout = Layout.of(path)
     tables = _Tables(layout)
 
     def read(name: str) -> RawEpisode:
@@ -139,16 +68,18 @@ def open_raw(path: str | os.PathLike[str]) -> Iterator[Mapping[str, RawEpisode]]
 
 
 def read_metadata(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a data set says about itself: ``dataset_id``, ``fps``, and ``task`` where it has one.
+    """What a data set says about itself: ``dataset_id``, ``fps``, ``robot_type``, its one ``task``.
 
     Raises:
         DataError: as :func:`open_raw`.
     """
-    layout = _Layout.of(path)
+    layout = Layout.of(path)
     told: dict[str, Any] = {"dataset_id": layout.path.resolve().name}
     fps = layout.info.get("fps")
     if isinstance(fps, int | float) and not isinstance(fps, bool) and 0 < fps < float("inf"):
         told["fps"] = float(fps)
+    if isinstance(robot := layout.info.get("robot_type"), str):
+        told["robot_type"] = robot
     tasks = {rows.task for rows in layout.episodes.values()}
     if len(tasks) == 1 and (task := tasks.pop()):
         told["task"] = task
@@ -161,7 +92,7 @@ def find_oddities(path: str | os.PathLike[str]) -> list[str]:
     Raises:
         DataError: as :func:`open_raw`.
     """
-    layout = _Layout.of(path)
+    layout = Layout.of(path)
     oddities = []
     steps = sum(rows.count for rows in layout.episodes.values())
     for key, found in (("total_episodes", len(layout.episodes)), ("total_frames", steps)):
@@ -178,102 +109,13 @@ def find_oddities(path: str | os.PathLike[str]) -> list[str]:
     return oddities
 
 
-# -- meta ------------------------------------------------------------------------------------------
-
-
-def _read_info(path: Path) -> dict[str, Any]:
-    file = path / "meta" / "info.json"
-    _refuse_pointer(file)
-    info = read_json(file, "LeRobot's description of a data set")
-    if not isinstance(info, dict):
-        raise DataError(file, None, f"{type(info).__name__}; valid: a JSON object")
-    version = info.get("codebase_version")
-    if version not in (*_OLD, *_NEW):
-        message = f"{version!r}; valid: {', '.join((*_OLD, *_NEW))}"
-        raise DataError(file, "codebase_version", message)
-    if not isinstance(info.get("features"), dict):
-        raise DataError(file, "features", "missing; valid: a JSON object")
-    return info
-
-
-def _refuse_pointer(file: Path) -> None:
-    if not file.is_file():
-        raise DataError(file, None, "no such file")
-    with file.open("rb") as stream:
-        if stream.read(23) == b"version https://git-lfs":
-            message = "a git-LFS pointer, not the data; `git lfs pull` fetches them"
-            raise DataError(file, None, message)
-
-
-def _whole(path: Path, row: Mapping[str, Any], key: str, where: str) -> int:
-    value = row.get(key)
-    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-        message = f"{where}: {key} is {value!r}; valid: a whole number"
-        raise DataError(path, "meta", message)
-    return value
-
-
-def _read_lines(path: Path, name: str) -> list[dict[str, Any]]:
-    file = path / "meta" / f"{name}.jsonl"
-    _refuse_pointer(file)
-    rows = []
-    try:
-        for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
-            row = json.loads(line) if line.strip() else None
-            if not isinstance(row, dict | None):
-                raise DataError(file, f"line {number}", "valid: a JSON object")
-            rows += [] if row is None else [row]
-    except (OSError, ValueError, RecursionError) as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(file, None, f"not JSON, a line for each episode ({error})") from error
-    return rows
-
-
-def _read_table(path: Path, name: str) -> list[dict[str, Any]]:
-    files = sorted((path / name).rglob("*.parquet"))
-    if not files:
-        raise DataError(path / name, None, "no parquet file; valid: at least one")
-    rows = []
-    keys = ("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index")
-    for file in files:
-        with _opened(file) as parquet:
-            present = [
-                key for key in parquet.schema_arrow.names if key in keys or key.startswith("data/")
-            ]
-            rows += parquet.read(columns=present).to_pylist()
-    return sorted(rows, key=lambda row: (str(type(row.get("episode_index"))), _order(row)))
-
-
-def _order(row: Mapping[str, Any]) -> int:
-    number = row.get("episode_index")
-    return number if isinstance(number, int) else 0
-
-
-@contextmanager
-def _opened(file: Path) -> Iterator[Any]:
-    """A parquet file; whatever pyarrow raises inside becomes a DataError."""
-    _refuse_pointer(file)
-    with needs("data"):
-        import pyarrow as pa
-        from pyarrow.parquet import ParquetFile
-    try:
-        with ParquetFile(file, page_checksum_verification=True) as parquet:
-            yield parquet
-    except DataError:
-        raise
-    except (pa.ArrowException, OSError, ValueError, KeyError, OverflowError) as error:
-        reason = str(error).strip().partition("\n")[0]
-        raise DataError(file, None, f"not a whole parquet file ({reason})") from error
-
-
 # -- data ------------------------------------------------------------------------------------------
 
 
 class _Tables:
     """Numbers of one data file at a time: neighbouring episodes share it."""
 
-    def __init__(self, layout: _Layout) -> None:
+    def __init__(self, layout: Layout) -> None:
         self.layout = layout
         self.name: str | None = None
         self.table: Any = None
@@ -282,18 +124,34 @@ class _Tables:
     def read(self, name: str) -> Any:
         """The columns of numbers of a data file."""
         if name != self.name:
-            with _opened(self.layout.path / name) as parquet:
+            with open_parquet(self.layout.path / name) as parquet:
                 fields = {field.name: field.type for field in parquet.schema_arrow}
+                self._check(self.layout.path / name, parquet, fields)
                 numbers = [key for key, kind in fields.items() if _holds_numbers(kind)]
                 self.table = parquet.read(columns=numbers)
             self.left_alone = [key for key in fields if key not in numbers]
             self.name = name
         return self.table
 
+    def _check(self, file: Path, parquet: Any, fields: Mapping[str, Any]) -> None:
+        rows = parquet.metadata.num_rows
+        valid = self.layout.steps[file.relative_to(self.layout.path).as_posix()]
+        if rows != valid:
+            raise DataError(file, None, f"{rows} rows; valid: {valid}, as meta/episodes says")
+        for key in parquet.schema_arrow.names:
+            if parquet.schema_arrow.names.count(key) > 1:
+                raise DataError(file, key, "several columns of this name; valid: one")
+        for key, feature in self.layout.info["features"].items():
+            told = feature.get("dtype") if isinstance(feature, dict) else None
+            if told != "video" and key not in fields:
+                raise DataError(file, key, "missing, but meta/info.json tells of it")
+
 
 def _holds_numbers(kind: Any) -> bool:
     with needs("data"):
         import pyarrow as pa
+    # datasets' arrays of several dimensions, once that package is imported.
+    kind = kind.storage_type if isinstance(kind, pa.BaseExtensionType) else kind
     while (
         pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
     ):
@@ -301,13 +159,10 @@ def _holds_numbers(kind: Any) -> bool:
     return pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
 
 
-def _read_episode(layout: _Layout, name: str, tables: _Tables) -> RawEpisode:
+def _read_episode(layout: Layout, name: str, tables: _Tables) -> RawEpisode:
     rows = layout.episodes[name]
     file = layout.path / rows.file
     table = tables.read(rows.file)
-    if rows.start + rows.count > len(table):
-        message = f"{len(table)} rows; valid: {rows.start + rows.count}, as meta/episodes says"
-        raise DataError(file, None, message)
     part = table.slice(rows.start, rows.count)
     arrays = {key: _array(file, key, part[key], rows.start) for key in part.column_names}
     number = int(name.rpartition("_")[2])
@@ -330,7 +185,7 @@ def _read_episode(layout: _Layout, name: str, tables: _Tables) -> RawEpisode:
     extras = {key: array for key, array in arrays.items() if key not in known}
     flags = {
         key: _flags(file, key, steps[key], rows.start)
-        for key in ("next.done", "next.success")
+        for key in ("next.done", "next.success", "next.terminated")
         if key in steps
     }
     if "next.success" in flags:
@@ -340,6 +195,7 @@ def _read_episode(layout: _Layout, name: str, tables: _Tables) -> RawEpisode:
         actions=_column(arrays["action"]),
         rewards=steps.get("next.reward"),
         dones=flags.get("next.done"),
+        terminated=flags.get("next.terminated"),
         extras=extras,
         attributes={"task": rows.task} if rows.task else {},
         left_alone=tuple(tables.left_alone),
@@ -354,6 +210,8 @@ def _array(file: Path, key: str, column: Any, start: int) -> np.ndarray:
     array = column.combine_chunks()
     if isinstance(array, pa.ChunkedArray):
         array = pa.concat_arrays(array.chunks)
+    if isinstance(array.type, pa.BaseExtensionType):
+        array = array.storage
     shape = [len(array)]
     while True:
         if array.null_count:
@@ -369,11 +227,12 @@ def _array(file: Path, key: str, column: Any, start: int) -> np.ndarray:
             raise DataError(file, key, message)
         shape.append(int(sizes[0]))
         array = array.flatten()
-    return array.to_numpy(zero_copy_only=False).reshape(shape)
+    # A copy: pyarrow's memory is read only, and the file's other episodes lie beside it.
+    return array.to_numpy(zero_copy_only=False).reshape(shape).copy()
 
 
 def _check_indices(
-    layout: _Layout, file: Path, arrays: Mapping[str, np.ndarray], rows: _Rows, number: int
+    layout: Layout, file: Path, arrays: Mapping[str, np.ndarray], rows: Rows, number: int
 ) -> None:
     """Compares the indices of an episode's rows with where it is said to lie."""
     frames = np.arange(rows.count)
@@ -418,7 +277,7 @@ def _column(array: np.ndarray) -> np.ndarray:
     return array[:, None] if array.ndim == 1 else array
 
 
-def _parts(layout: _Layout, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _parts(layout: Layout, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Parts of the observation: a column each, or as the features name its numbers."""
     parts: dict[str, np.ndarray] = {}
     for key, array in arrays.items():

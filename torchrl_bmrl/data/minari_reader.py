@@ -255,6 +255,8 @@ def _check_lengths(path: Path, name: str, arrays: Mapping[str, np.ndarray]) -> i
     # Where one array differs from all others, it is the one at fault, even if it is the actions.
     steps = Counter(len(array) - more[key] for key, array in arrays.items()).most_common(1)[0][0]
     for key, array in arrays.items():
+        if key == "rewards" and array.ndim > 1:
+            raise DataError(path, f"{name}/{key}", f"shape {array.shape}; valid: ({steps},)")
         if len(array) != steps + more[key]:
             message = f"shape {array.shape}; valid: {steps + more[key]} rows"
             raise DataError(path, f"{name}/{key}", f"{message}, since most arrays are of {steps}")
@@ -292,8 +294,6 @@ def _read_infos(
     for info in infos:
         key = f"{name}/infos/{info}"
         node = read_node(path, file, key)
-        if node is None:
-            raise DataError(path, key, "missing: a link to nowhere")
         if info == flags:
             array = read_array(path, file, key)
             if array.shape not in ((steps,), (steps + 1,)):

@@ -14,12 +14,22 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
 
-from torchrl_bmrl.data.sampler import DatasetBuffer, Device, MemmapStorage, TaskSampler
+from torchrl_bmrl.data.sampler import (
+    DatasetBuffer,
+    Device,
+    DeviceStorage,
+    MemmapStorage,
+    TaskSampler,
+)
 from torchrl_bmrl.errors import BMRLError, ConfigError
 
+EPISODE_NUMBERS = tuple(
+    key for own in (("episode",), ("collector", "traj_ids")) for key in (own, ("previous", *own))
+)
+"""Keys of what numbers episodes."""
 PREFETCH = 2
 """Samples prepared ahead where every sample is transferred to the device."""
 
@@ -27,10 +37,12 @@ PREFETCH = 2
 def with_previous(data: TensorDictBase, keys: Sequence[Any]) -> TensorDictBase:
     """Adds to each transition the one before it in its episode, under ``"previous"``.
 
-    The first transition of an episode is its own predecessor.
+    The first transition of an episode is its own predecessor, and so is one whose predecessor is
+    not in the data.
 
     Args:
-        data: batch ``[N]`` in the order of the episodes, with ``step``.
+        data: batch ``[N]`` in the order of the episodes, with ``step``; where it has ``episode``,
+            too, transitions of two episodes are never joined.
         keys: the keys of a transition to copy.
 
     Example:
@@ -39,7 +51,12 @@ def with_previous(data: TensorDictBase, keys: Sequence[Any]) -> TensorDictBase:
         >>> with_previous(data, ["x"])["previous", "x"]
         tensor([0, 0, 2])
     """
-    index = torch.arange(len(data)) - (data.get("step") > 0).long()
+    step, episode = data.get("step"), data.get("episode", None)
+    follows = torch.zeros_like(step, dtype=torch.bool)
+    follows[1:] = step[1:] == step[:-1] + 1
+    if episode is not None:
+        follows[1:] &= episode[1:] == episode[:-1]
+    index = torch.arange(len(data), device=step.device) - follows.long()
     return data.copy().set("previous", data.select(*keys)[index])
 
 
@@ -100,7 +117,8 @@ def make_multi_task_replay_buffer(
 
     Args:
         datasets: one batch ``[N_i]`` per task, in the order of the tasks, with equal keys, shapes
-            and dtypes; copied once.
+            and dtypes; copied once, with numbers of their own for the episodes of each
+            (:func:`number_episodes`).
         batch_size: transitions a row.
         weights: without them, row i is of task i. With them, one positive number per task, each
             row is of a task drawn in their proportion, with replacement: a sample may have two rows
@@ -143,7 +161,8 @@ def make_mixed_replay_buffer(
     """Buffer over a mixture of data sets, such as scripted and human demonstrations of one task.
 
     Args:
-        datasets: batches ``[N_i]`` with equal keys, shapes and dtypes; copied once.
+        datasets: batches ``[N_i]`` with equal keys, shapes and dtypes; copied once, with numbers of
+            their own for the episodes of each (:func:`number_episodes`).
         weights: one number per data set, none negative: a transition is of data set i with the
             probability ``weights[i] / sum(weights)``, however large the data set is.
         batch_size: transitions a sample.
@@ -170,6 +189,53 @@ def make_mixed_replay_buffer(
     return _make_buffer(datasets, weights, True, batch_size, device, prefetch, scratch_dir)
 
 
+def number_episodes(datasets: Sequence[TensorDictBase]) -> list[TensorDictBase]:
+    """Data sets in which no two episodes have one number, so that nothing joins steps of both.
+
+    The episodes of every file are numbered from 0. Those of a data set go on after the ones before
+    it; numbers that are larger anyway stay.
+
+    Args:
+        datasets: batches ``[N_i]``; they stay as they are.
+
+    Returns:
+        the same data, with other ``episode`` and ``("collector", "traj_ids")``, those under
+        ``"previous"`` included, where they are whole numbers.
+
+    Raises:
+        BMRLError: if the numbers are too many for their type.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> data = TensorDict({"episode": torch.tensor([0, 0, 1])}, [3])
+        >>> [part["episode"].tolist() for part in number_episodes([data, data])]
+        [[0, 0, 1], [2, 2, 3]]
+    """
+    numbered, free = [], 0
+    for number, data in enumerate(datasets):
+        keys = [key for key in EPISODE_NUMBERS if _is_whole(data.get(key, None))]
+        if keys and len(data):
+            low = min(int(data.get(key).min()) for key in keys)
+            high = max(int(data.get(key).max()) for key in keys)
+            shift = max(free - low, 0) if number else 0
+            free = max(free, high + shift + 1)
+            for key in keys if shift else ():
+                value = data.get(key)
+                if high + shift > torch.iinfo(value.dtype).max:
+                    raise BMRLError(
+                        f"data set {number}: {key!r} is {value.dtype}; valid: a type that holds "
+                        f"{high + shift}, as the episodes of all data sets are numbered together"
+                    )
+                data = data.copy().set(key, value + shift)
+        numbered.append(data)
+    return numbered
+
+
+def _is_whole(value: Any) -> bool:
+    kinds = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+    return isinstance(value, torch.Tensor) and value.dtype in kinds
+
+
 def fits(datasets: Sequence[TensorDictBase], device: torch.device) -> bool:
     """Whether data take at most half of a CUDA device's free memory; no other device is asked.
 
@@ -194,7 +260,7 @@ def _make_buffer(
     target = check_device(device)
     sizes = [len(data) for data in datasets]
     if target.type != "cpu" and fits(datasets, target):
-        storage = LazyTensorStorage(sum(sizes), device=target)
+        storage = DeviceStorage(sum(sizes), device=target)
     else:
         storage = MemmapStorage(sum(sizes), scratch_dir=scratch_dir)
     transferred = storage.device != target
@@ -203,7 +269,7 @@ def _make_buffer(
     _check_count("prefetch", prefetch, 0)
     end = 0
     try:
-        for data in datasets:
+        for data in number_episodes(datasets):
             start, end = end, end + len(data)
             storage.set(slice(start, end), data)
     except (OSError, RuntimeError) as error:

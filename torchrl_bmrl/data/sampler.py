@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.data import LazyMemmapStorage, TensorDictReplayBuffer
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
@@ -155,7 +155,24 @@ class TaskSampler(Sampler):
         """Nothing to forget: the data sets stay."""
 
 
-class MemmapStorage(LazyMemmapStorage):
+class HandsOutCopies(Storage):
+    """Never hands out its own tensordict.
+
+    All rows at once, ``buffer[:]``, are TorchRL's storages' own: a buffer's transforms write to
+    them, and what was normalised is normalised again at the next call, and in all samples.
+    """
+
+    def get(self, index: Any) -> Any:
+        """Rows of the data; tensors may be those of the storage."""
+        data = super().get(index)
+        return data.copy() if data is self._storage else data
+
+
+class DeviceStorage(HandsOutCopies, LazyTensorStorage):
+    """Data in the memory of a device."""
+
+
+class MemmapStorage(HandsOutCopies, LazyMemmapStorage):
     """Takes rows by index_select, which copies them whole: twice as fast as indexing on the CPU."""
 
     def get(self, index: Any) -> Any:

@@ -12,6 +12,7 @@ import numpy as np
 
 from torchrl_bmrl.data.account import Account
 from torchrl_bmrl.data.episodes import Episode, name_fault
+from torchrl_bmrl.data.oddities import Oddities
 from torchrl_bmrl.data.options import Bounds, ReadOptions
 from torchrl_bmrl.errors import ConfigError, DataError
 
@@ -304,6 +305,7 @@ def summarise(
     layout: Layout | None = None
     seen: dict[str, list[str]] = {}
     jumps: list[str] = []
+    oddities = Oddities()
     for name in episodes:
         try:
             episode = episodes[name]
@@ -317,6 +319,7 @@ def summarise(
         if not problems:
             layout = layout or layout_of(episode)
             _add(summary, name, episode)
+            oddities.add(name, episode)
             seen.setdefault(_digest(episode), []).append(name)
             if not is_continuous(episode):
                 jumps.append(name)
@@ -330,6 +333,7 @@ def summarise(
         *_warnings(summary, bounds),
         *_repeats(seen),
         *_jumps(jumps),
+        *oddities.warnings(),
     ]
     return summary
 

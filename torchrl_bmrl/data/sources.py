@@ -19,10 +19,12 @@ from torchrl_bmrl.data.raw import RawEpisode, complete, success_fault
 from torchrl_bmrl.errors import ConfigError, DataError
 
 _STRUCTURE = (
-    *("total_episodes", "total_steps", "dataset_size", "dataset_id", "minari_version"),
-    *("data_format", "observation_space", "action_space", "total", "masks"),
+    *("action_bounds", "action_space", "observation_space", "data_format", "dataset_id"),
+    *("dataset_size", "env_args", "env_spec", "masks", "minari_version", "total"),
+    *("total_episodes", "total_steps"),
 )
-"""What a data set says of itself that is not true of a copy in another format."""
+"""What formats say of their own files, and names that have a meaning of their own here."""
+
 FORMATS = ("robomimic", "robosuite", "minari", "d4rl", "lerobot")
 
 
@@ -141,6 +143,18 @@ def open_source(
         DataError: for a missing or damaged data set.
         ConfigError: for a robosuite file without ``task``, and for options that are invalid or that
             another format has no use for.
+
+    Example:
+        >>> import tempfile
+        >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.ones(5)
+        >>> episode = Episode(
+        ...     observations=x, next_observations=x, actions=a, rewards=r, terminated=r > 1
+        ... )
+        >>> path = Path(tempfile.mkdtemp()) / "lift.hdf5"
+        >>> robomimic.write_episodes(path, [episode] * 2, env_args={})
+        >>> with open_source(path, reward="last") as source:
+        ...     source.format, [episode.rewards.sum() for episode in source.episodes.values()]
+        ('robomimic', [1.0, 1.0])
     """
     path = Path(path).expanduser()
     chosen = ReadOptions(**options)
@@ -258,17 +272,19 @@ def _open_other(stack: ExitStack, path: Path, form: str, options: ReadOptions) -
     further = {"horizon": options.horizon} if form == "d4rl" else {}
     episodes = stack.enter_context(reader.open_raw(path, **further))
     told = reader.read_metadata(path)
+    if form == "d4rl":  # whose own are below these names
+        told = told["attributes"] | told["metadata"]
     # As gymnasium's environments are in robomimic's layout.
     env_args = {"env_name": told.get("dataset_id", path.stem), "type": 2, "env_kwargs": {}}
-    further_told = {**told, **told.get("attributes", {}), **told.get("metadata", {})}
+    own = {key: told[key] for key in ("action_bounds",) if form == "minari" and key in told}
     kept = {
         key: value
-        for key, value in further_told.items()
-        if key == "action_bounds" or (key not in _STRUCTURE and _fits_attribute(value))
+        for key, value in told.items()
+        if key not in _STRUCTURE and _fits_attribute(value)
     }
     return _Opened(
         episodes=episodes,
-        metadata={**kept, "env_args": env_args},
+        metadata={**kept, **own, "env_args": env_args},
         oddities=reader.find_oddities(path, **further),
     )
 

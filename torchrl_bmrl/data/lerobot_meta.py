@@ -1,0 +1,206 @@
+"""What the folder ``meta`` of a LeRobot data set says: where each episode lies."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.extras import needs
+from torchrl_bmrl.files import read_json
+
+_OLD, _NEW = ("v2.0", "v2.1"), ("v3.0",)
+_OLD_FILE = "data/chunk-{chunk:03d}/episode_{episode:06d}.parquet"
+_NEW_FILE = "data/chunk-{chunk:03d}/file-{file:03d}.parquet"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """Where an episode lies: its file, its first row there, its rows, and its place in the set."""
+
+    file: str
+    start: int
+    count: int
+    index: int
+    task: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """What the folder ``meta`` says of a data set.
+
+    Attributes:
+        path: the data set's folder.
+        info: content of ``info.json``.
+        episodes: where each episode lies, by name.
+        steps: rows of each data file.
+    """
+
+    path: Path
+    info: Mapping[str, Any]
+    episodes: Mapping[str, Rows]
+    steps: Mapping[str, int]
+
+    @classmethod
+    def of(cls, path: str | os.PathLike[str]) -> Layout:
+        """Reads and checks the folder ``meta``.
+
+        Raises:
+            DataError: naming file and row, for a version that is not read, episodes whose rows do
+                not follow one another, and data files that no episode lies in.
+        """
+        path = Path(path)
+        info = _read_info(path)
+        new = info["codebase_version"] in _NEW
+        listed = (
+            _read_table(path, "meta/episodes") if new else _ordered(_read_lines(path, "episodes"))
+        )
+        rows: dict[str, Rows] = {}
+        first_of_file: dict[str, int] = {}
+        steps_of_file: dict[str, int] = {}
+        start = 0
+        for i, row in enumerate(listed):
+            where = f"row {i}"
+            number, count = (_whole(path, row, key, where) for key in ("episode_index", "length"))
+            if number != i or count < 1:
+                message = f"{where}: episode_index {number}, length {count}; valid: {i}, 1 or more"
+                raise DataError(path, "meta/episodes", message)
+            if new:
+                chunk, file, begin, end = (
+                    _whole(path, row, key, where)
+                    for key in (
+                        "data/chunk_index",
+                        "data/file_index",
+                        "dataset_from_index",
+                        "dataset_to_index",
+                    )
+                )
+                if (begin, end) != (start, start + count):
+                    message = f"{where}: rows {begin} to {end}; valid: {start} to {start + count}"
+                    raise DataError(path, "meta/episodes", message)
+                name = _NEW_FILE.format(chunk=chunk, file=file)
+            else:
+                chunk = i // info.get("chunks_size", 1000)
+                name = _OLD_FILE.format(chunk=chunk, episode=i)
+            first = first_of_file.setdefault(name, start)
+            steps_of_file[name] = steps_of_file.get(name, 0) + count
+            tasks = row.get("tasks")
+            tasks = tasks if isinstance(tasks, list) else [tasks]
+            rows[f"episode_{i}"] = Rows(
+                file=name,
+                start=start - first,
+                count=count,
+                index=start,
+                task=", ".join(str(task) for task in tasks if task is not None),
+            )
+            start += count
+        if not rows:
+            raise DataError(path, "meta/episodes", "no episodes; valid: at least one")
+        for stray in sorted((path / "data").rglob("*.parquet")):
+            # LeRobot would read its steps, too.
+            if str(stray.relative_to(path).as_posix()) not in steps_of_file:
+                raise DataError(stray, None, "in no episode; valid: a file that meta tells of")
+        return cls(path=path, info=info, episodes=rows, steps=steps_of_file)
+
+
+def _read_info(path: Path) -> dict[str, Any]:
+    file = path / "meta" / "info.json"
+    _refuse_pointer(file)
+    info = read_json(file, "LeRobot's description of a data set")
+    if not isinstance(info, dict):
+        raise DataError(file, None, f"{type(info).__name__}; valid: a JSON object")
+    version = info.get("codebase_version")
+    if version not in (*_OLD, *_NEW):
+        message = f"{version!r}; valid: {', '.join((*_OLD, *_NEW))}"
+        raise DataError(file, "codebase_version", message)
+    if not isinstance(info.get("features"), dict):
+        raise DataError(file, "features", "missing; valid: a JSON object")
+    fps, chunks_size = info.get("fps"), info.get("chunks_size", 1000)
+    # bool is an int in Python; a larger number is no rate, and may be no float.
+    if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 < fps < 1e9:
+        raise DataError(file, "fps", f"{fps!r}; valid: a positive number")
+    if not isinstance(chunks_size, int) or isinstance(chunks_size, bool) or chunks_size < 1:
+        raise DataError(file, "chunks_size", f"{chunks_size!r}; valid: 1 or more")
+    return info
+
+
+def _refuse_pointer(file: Path) -> None:
+    if not file.is_file():
+        raise DataError(file, None, "no such file")
+    with file.open("rb") as stream:
+        if stream.read(23) == b"version https://git-lfs":
+            message = "a git-LFS pointer, not the data; `git lfs pull` fetches them"
+            raise DataError(file, None, message)
+
+
+def _whole(path: Path, row: Mapping[str, Any], key: str, where: str) -> int:
+    value = row.get(key)
+    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+        message = f"{where}: {key} is {value!r}; valid: a whole number"
+        raise DataError(path, "meta", message)
+    return value
+
+
+def _read_lines(path: Path, name: str) -> list[dict[str, Any]]:
+    file = path / "meta" / f"{name}.jsonl"
+    _refuse_pointer(file)
+    rows = []
+    try:
+        # Not splitlines: a text may hold other ends of lines, such as U+2028.
+        lines = file.read_text(encoding="utf-8").split("\n")
+        for number, line in enumerate(lines, 1):  # no other ends
+            row = json.loads(line) if line.strip() else None
+            if not isinstance(row, dict | None):
+                raise DataError(file, f"line {number}", "valid: a JSON object")
+            rows += [] if row is None else [row]
+    except (OSError, ValueError, RecursionError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(file, None, f"not JSON, a line for each episode ({error})") from error
+    return rows
+
+
+def _read_table(path: Path, name: str) -> list[dict[str, Any]]:
+    files = sorted((path / name).rglob("*.parquet"))
+    if not files:
+        raise DataError(path / name, None, "no parquet file; valid: at least one")
+    rows = []
+    keys = ("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index")
+    for file in files:
+        with open_parquet(file) as parquet:
+            present = [
+                key for key in parquet.schema_arrow.names if key in keys or key.startswith("data/")
+            ]
+            rows += parquet.read(columns=present).to_pylist()
+    return _ordered(rows)
+
+
+def _ordered(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return sorted(rows, key=lambda row: (str(type(row.get("episode_index"))), _order(row)))
+
+
+def _order(row: Mapping[str, Any]) -> int:
+    number = row.get("episode_index")
+    return number if isinstance(number, int) else 0
+
+
+@contextmanager
+def open_parquet(file: Path) -> Iterator[Any]:
+    """A parquet file; whatever pyarrow raises inside becomes a DataError."""
+    _refuse_pointer(file)
+    with needs("data"):
+        import pyarrow as pa
+        from pyarrow.parquet import ParquetFile
+    try:
+        with ParquetFile(file, page_checksum_verification=True) as parquet:
+            yield parquet
+    except DataError:
+        raise
+    except (pa.ArrowException, OSError, ValueError, KeyError, OverflowError) as error:
+        reason = str(error).strip().partition("\n")[0]
+        raise DataError(file, None, f"not a whole parquet file ({reason})") from error
