@@ -29,17 +29,15 @@ import numpy as np
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.hdf5 import DAMAGE, write_attributes
 from torchrl_bmrl.data.options import Bounds, check_bounds
-from torchrl_bmrl.data.robomimic_reader import (
+from torchrl_bmrl.data.robomimic_file import (
     MASKS,
-    STEP_KEYS,
     count_episodes,
     count_steps,
     find_mask_problems,
     find_oddities,
-    open_episodes,
-    open_raw,
     read_metadata,
 )
+from torchrl_bmrl.data.robomimic_reader import STEP_KEYS, open_episodes, open_raw
 from torchrl_bmrl.data.schema import check_episode, layout_of
 from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.extras import needs

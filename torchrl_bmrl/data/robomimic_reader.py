@@ -7,8 +7,6 @@ others: no ``next_obs``, no ``rewards``, an attribute ``success`` in place of an
 
 from __future__ import annotations
 
-import json
-import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -27,17 +25,16 @@ from torchrl_bmrl.data.hdf5 import (
     read_attributes,
     read_names,
     read_node,
-    read_strings,
 )
-from torchrl_bmrl.data.options import ReadOptions, check_bounds
+from torchrl_bmrl.data.options import ReadOptions
 from torchrl_bmrl.data.raw import RawEpisode, complete
-from torchrl_bmrl.errors import ConfigError, DataError
+from torchrl_bmrl.data.robomimic_file import episode_names
+from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.extras import needs
 
 with needs("data"):
     import h5py
 
-MASKS = ("train", "valid")
 STEP_KEYS = ("actions", "rewards", "dones", "terminated", "obs", "next_obs")
 
 
@@ -115,97 +112,6 @@ def open_raw(
             return _read_raw(path, file, f"data/{name}", options, known, wanted, attributes)
 
         yield LazyEpisodes(names, read)
-
-
-# -- which episodes there are ----------------------------------------------------------------------
-
-
-def episode_names(path: str | Path, file: h5py.File, split: str | None = None) -> list[str]:
-    """Names of all demonstrations, or of a mask's.
-
-    Raises:
-        DataError: if there are none, or the mask is missing or names one that is.
-    """
-    names, _ = _demonstrations(path, file)
-    if split is not None:
-        masks = read_masks(path, file)
-        if split not in masks:
-            valid = ", ".join(masks) or "none; the file has no masks"
-            raise DataError(path, f"mask/{split}", f"missing; valid masks: {valid}")
-        names = _read_mask(path, file, split, set(names))
-    if not names:
-        raise DataError(path, f"mask/{split}" if split else "data", "no demonstrations")
-    return names
-
-
-def _demonstrations(path: str | Path, file: h5py.File) -> tuple[list[str], list[str]]:
-    """Names of the demonstrations below ``data``, and of what lies beside them."""
-    names: list[str] = []
-    beside: list[str] = []
-    for name in read_names(path, file, "data"):
-        # What is named like one is one, damaged or not.
-        found = re.fullmatch(r"demo_?\d+", name) or _is_demonstration(path, file, f"data/{name}")
-        (names if found else beside).append(name)
-    return names, beside
-
-
-def _is_demonstration(path: str | Path, file: h5py.File, key: str) -> bool:
-    node = read_node(path, file, key)
-    if not isinstance(node, h5py.Group):
-        return node is None  # damaged: reading it will say so
-    return bool({"actions", "obs", "states"} & set(read_names(path, file, key)))
-
-
-def _read_mask(path: str | Path, file: h5py.File, mask: str, known: set[str]) -> list[str]:
-    names = read_strings(path, file, f"mask/{mask}")
-    seen: set[str] = set()
-    for row, name in enumerate(names):
-        if name not in known or name in seen:
-            fault = "again" if name in known else "which is not in the file"
-            raise DataError(path, f"mask/{mask}", f"row {row} names {name!r}, {fault}")
-        seen.add(name)
-    return names
-
-
-def read_masks(path: str | Path, file: h5py.File) -> list[str]:
-    """Names of a file's masks."""
-    return read_names(path, file, "mask") if "mask" in read_names(path, file, "/") else []
-
-
-def count_episodes(path: str | Path) -> int:
-    """Number of demonstrations in a file.
-
-    Raises:
-        DataError: if the file is missing, damaged or has no ``data`` group.
-    """
-    with open_file(path) as file:
-        return len(_demonstrations(path, file)[0])
-
-
-def count_steps(path: str | Path, episodes: Mapping[str, Episode]) -> int:
-    """Steps of the episodes of a file together, without reading what need not be read.
-
-    Args:
-        path: the file.
-        episodes: of :func:`open_episodes`.
-
-    Raises:
-        DataError: if the file is damaged or lacks the actions of one.
-    """
-    total = 0
-    with open_file(path) as file:
-        for name in episodes:
-            key = f"data/{name}/actions"
-            try:
-                whole = "next_obs" in file[f"data/{name}"]
-                total += len(file[key]) if whole else 0
-            except DAMAGE as error:
-                raise DataError(path, key, f"missing or unreadable ({error})") from error
-            total += 0 if whole else len(episodes[name])
-    return total
-
-
-# -- one episode -----------------------------------------------------------------------------------
 
 
 def _foreign_parts(path: str | Path, file: h5py.File, names: list[str]) -> set[str]:
@@ -400,111 +306,3 @@ def _read_column(path: str | Path, file: h5py.File, key: str) -> np.ndarray:
     if not array.ndim:
         raise DataError(path, key, "one number; valid: a row for each step")
     return array[:, 0] if array.shape[1:] == (1,) else array
-
-
-# -- the file as a whole ---------------------------------------------------------------------------
-
-
-def read_metadata(path: str | Path) -> dict[str, Any]:
-    """Attributes of a file, ``env_args`` and ``action_bounds`` parsed, and its masks.
-
-    Returns:
-        the attributes by name, and ``masks``: names of demonstrations by mask. Where the file
-        states them, ``action_bounds`` has ``low`` and ``high``, a number or a list of one for each
-        dimension.
-
-    Raises:
-        DataError: if the file is missing or damaged, or ``env_args`` or ``action_bounds`` are not
-            what they should be.
-    """
-    with open_file(path) as file:
-        read_names(path, file, "data")
-        attributes = read_attributes(path, file, "data")
-        masks = read_masks(path, file)
-        attributes["masks"] = {name: read_strings(path, file, f"mask/{name}") for name in masks}
-    attributes["env_args"] = _parse(path, "env_args", attributes.get("env_args", "{}"))
-    if "action_bounds" in attributes:
-        bounds = _parse(path, "action_bounds", attributes["action_bounds"])
-        try:
-            check_bounds((bounds["low"], bounds["high"]), "action_bounds")
-        except (KeyError, ConfigError) as error:
-            message = f"attribute action_bounds is {bounds}; valid: low and high, low < high"
-            raise DataError(path, "data", message) from error
-        attributes["action_bounds"] = bounds
-    return attributes
-
-
-def _parse(path: str | Path, name: str, text: Any) -> dict[str, Any]:
-    try:
-        parsed = json.loads(text)
-    except (TypeError, ValueError) as error:
-        raise DataError(path, "data", f"attribute {name} is not JSON ({error})") from error
-    if not isinstance(parsed, dict):
-        raise DataError(path, "data", f"attribute {name}; valid: a JSON object")
-    return parsed
-
-
-def find_mask_problems(path: str | Path) -> list[tuple[str, str]]:
-    """What is wrong with each mask of a file: key and message."""
-    problems = []
-    with open_file(path) as file:
-        known = set(_demonstrations(path, file)[0])
-        for mask in read_masks(path, file):
-            try:
-                _read_mask(path, file, mask, known)
-            except DataError as error:
-                problems.append((error.key or "mask", error.message))
-    return problems
-
-
-def find_oddities(path: str | Path) -> list[str]:
-    """What deserves a look in a file beside its episodes: warnings."""
-    oddities = []
-    with open_file(path) as file:
-        names, beside = _demonstrations(path, file)
-        others = [name for name in read_names(path, file, "/") if name not in ("data", "mask")]
-        if beside := [*(f"data/{name}" for name in beside), *others]:
-            oddities.append(f"left alone, beside the demonstrations: {', '.join(beside)}")
-        cut = [name for name in names if "next_obs" not in read_names(path, file, f"data/{name}")]
-        if cut:
-            oddities.append(f"{len(cut)} episodes have no next_obs, such as {cut[0]}")
-        oddities += _find_contradictions(path, file, names)
-        present = read_masks(path, file)
-        if set(MASKS) <= set(present):
-            train, valid = (set(read_strings(path, file, f"mask/{mask}")) for mask in MASKS)
-            if both := sorted(train & valid):
-                oddities.append(
-                    f"{len(both)} episodes are in train and in valid, such as {both[0]}"
-                )
-    return oddities
-
-
-def _find_contradictions(path: str | Path, file: h5py.File, names: list[str]) -> Iterator[str]:
-    """Attributes that say another number of steps than the arrays; the arrays are believed."""
-    total, wrong = 0, []
-    try:
-        for name in names:
-            node = read_node(path, file, f"data/{name}/actions")
-            if not isinstance(node, h5py.Dataset) or not node.ndim:
-                return
-            total += len(node)
-            said = read_attribute(path, file, f"data/{name}", "num_samples")
-            if not _says(said, len(node)):
-                wrong.append(f"{name} says {said} of {len(node)}")
-        said = read_attribute(path, file, "data", "total")
-    except DataError:  # told by whoever reads the episodes
-        return
-    if wrong:
-        yield (
-            f"attribute num_samples contradicts the arrays in {len(wrong)} episodes, such as "
-            f"{wrong[0]} steps; the arrays are believed"
-        )
-    if not _says(said, total):
-        yield f"attribute total says {said} steps, the arrays have {total}, and are believed"
-
-
-def _says(said: Any, count: int) -> bool:
-    """Whether an attribute is missing, or that number in any of the ways that tools write it."""
-    if isinstance(said, list) and len(said) == 1:
-        said = said[0]
-    return said is None or said == count or said == str(count)
