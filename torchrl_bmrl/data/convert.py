@@ -174,7 +174,8 @@ class _Passing:
     def notes(self, to: str) -> Iterator[str]:
         """What the new data set lacks, or has otherwise."""
         for source in self.sources:
-            yield from source.oddities
+            where = f"{source.path}: " if len(self.sources) > 1 else ""
+            yield from (f"{where}{oddity}" for oddity in source.oddities)
         yield from self.account.warnings()
         named = {"robomimic": "demo", "minari": "episode", "lerobot": "episode"}[to]
         renamed = [
