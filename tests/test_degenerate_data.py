@@ -12,6 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+
+pytest.importorskip("h5py")
+pytest.importorskip("matplotlib")
+pytest.importorskip("scipy")
+pytest.importorskip("sklearn")
+
 from episode_files import TASK_PARTS, make_episode
 from helpers import make_distillation_loss
 from tensordict import TensorDict

@@ -14,11 +14,12 @@ from typing import Any
 
 import pytest
 
+import torchrl_bmrl
 from torchrl_bmrl.errors import BMRLError, MissingExtraError
 from torchrl_bmrl.extras import needs
 
 ROOT = Path(__file__).parents[1]
-PACKAGE = ROOT / "torchrl_bmrl"
+PACKAGE = Path(torchrl_bmrl.__file__).parent
 RECIPES = ROOT / "recipes"
 HIDDEN = {
     "robosuite": ["gymnasium", "llvmlite", "mujoco", "numba", "robosuite"],
@@ -42,7 +43,7 @@ def extras() -> set[str]:
 
 def modules() -> list[str]:
     """Every module of the package but commands."""
-    paths = [path.relative_to(ROOT).with_suffix("") for path in PACKAGE.rglob("*.py")]
+    paths = [path.relative_to(PACKAGE.parent).with_suffix("") for path in PACKAGE.rglob("*.py")]
     names = {".".join(path.parts).removesuffix(".__init__") for path in paths}
     return sorted(name for name in names if "__main__" not in name)
 
@@ -103,7 +104,7 @@ def bare_imports(node: ast.AST, inside: bool = False) -> Iterator[str]:
 
 @pytest.mark.parametrize("name", modules())
 def test_every_import_of_an_extras_package_names_the_extra(name: str) -> None:
-    path = ROOT.joinpath(*name.split("."))
+    path = PACKAGE.parent.joinpath(*name.split("."))
     path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
     tree = ast.parse(path.read_text())
     above = {package for top, package in FIRST.items() if name.startswith(f"{top}.")}

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("filelock")
+pytest.importorskip("yaml")
 
 from torchrl_bmrl.errors import FolderInUseError
 from torchrl_bmrl.locks import hold

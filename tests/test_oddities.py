@@ -9,6 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+pytest.importorskip("h5py")
+
 from episode_files import PARTS, TASK_PARTS, make_episode
 
 from torchrl_bmrl.data.episodes import Episode, LeftOut
