@@ -128,7 +128,7 @@ class _Passing:
         self.account = Account()
         self.extras: dict[str, None] = {}
         self.attributes: dict[str, None] = {}
-        self.rounded = self.whole_numbers = False
+        self.rounded = self.whole_numbers = self.bounded = False
 
     @property
     def names(self) -> list[str]:

@@ -23,19 +23,18 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_bmrl.data.arrays import as_flags, check_finite
 from torchrl_bmrl.data.d4rl_layout import (
     AFTER,
     ARRAYS,
     BEFORE,
     Flat,
     as_column,
-    check_flags,
     find_jumps,
     walk,
 )
 from torchrl_bmrl.data.episodes import LazyEpisodes
 from torchrl_bmrl.data.hdf5 import (
-    check_finite,
     open_file,
     read_array,
     read_attributes,
@@ -201,7 +200,7 @@ def _read_episode(path: str | Path, file: h5py.File, flat: Flat, rows: slice) ->
     if "successes" in extras:
         key = flat.extras["successes"]
         flags = as_column(path, key, extras["successes"])
-        extras["successes"] = check_flags(path, key, flags, rows.start)
+        extras["successes"] = as_flags(path, key, flags, rows.start)
     return RawEpisode(
         observations={part: read(key) for part, key in flat.parts.items()},
         next_observations={part: read(key) for part, key in flat.after.items()} or None,

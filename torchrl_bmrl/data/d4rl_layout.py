@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from torchrl_bmrl.data.arrays import as_flags
 from torchrl_bmrl.data.hdf5 import read_array, read_names, read_node
 from torchrl_bmrl.data.robomimic import STEP_KEYS
 from torchrl_bmrl.errors import ConfigError, DataError
@@ -236,24 +237,7 @@ def _check_alike(path: str | Path, file: h5py.File, before: str, after: str) -> 
 
 def _read_flags(path: str | Path, file: h5py.File, key: str) -> np.ndarray:
     flags = as_column(path, key, read_array(path, file, key))
-    return check_flags(path, key, flags, 0)
-
-
-def check_flags(path: str | Path, key: str, flags: np.ndarray, first: int) -> np.ndarray:
-    """Flags as booleans.
-
-    Args:
-        path: of the file, for messages.
-        key: of the array.
-        flags: ``(T,)``.
-        first: row of the file that the first of them is.
-
-    Raises:
-        DataError: for anything but 0 and 1.
-    """
-    for row in np.flatnonzero((flags != 0) & (flags != 1)):
-        raise DataError(path, key, f"{flags[row]} in row {first + row}; valid: 0 or 1")
-    return flags.astype(bool)
+    return as_flags(path, key, flags)
 
 
 def as_column(path: str | Path, key: str, array: np.ndarray) -> np.ndarray:

@@ -130,23 +130,6 @@ def read_array(
     raise DataError(path, key, "missing" if node is None else "a group; valid: a dataset")
 
 
-def check_finite(path: str | Path, key: str, array: np.ndarray, first: int = 0) -> None:
-    """Refuses NaN and infinity.
-
-    Args:
-        path: of the file, for messages.
-        key: of the array in the file, for messages.
-        array: with a row for each step.
-        first: row of the file that the first of them is.
-
-    Raises:
-        DataError: naming the row.
-    """
-    if array.dtype.kind == "f" and not (finite := np.isfinite(array)).all():
-        row = first + int(np.argwhere(~finite)[0][0])
-        raise DataError(path, key, f"a value that is not finite in row {row}")
-
-
 def read_strings(path: str | Path, file: h5py.File, key: str) -> list[str]:
     """The strings of a dataset, bytes or text.
 

@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_bmrl.data.arrays import as_flags, check_finite
 from torchrl_bmrl.data.episodes import LazyEpisodes
-from torchrl_bmrl.data.hdf5 import check_finite
 from torchrl_bmrl.data.lerobot_meta import Layout, Rows, open_parquet
 from torchrl_bmrl.data.raw import RawEpisode
 from torchrl_bmrl.errors import DataError
@@ -184,7 +184,7 @@ def _read_episode(layout: Layout, name: str, tables: _Tables) -> RawEpisode:
     }
     extras = {key: array for key, array in arrays.items() if key not in known}
     flags = {
-        key: _flags(file, key, steps[key], rows.start)
+        key: as_flags(file, key, steps[key], rows.start)
         for key in ("next.done", "next.success", "next.terminated")
         if key in steps
     }
@@ -264,13 +264,6 @@ def _one_number(file: Path, key: str, array: np.ndarray, start: int) -> np.ndarr
         message = f"{array.shape[1:]} numbers in row {start}; valid: one for each row"
         raise DataError(file, key, message)
     return array.reshape(-1)
-
-
-def _flags(file: Path, key: str, array: np.ndarray, start: int) -> np.ndarray:
-    if len(wrong := np.flatnonzero((array != 0) & (array != 1))):
-        message = f"{array[wrong[0]]} in row {start + wrong[0]}; valid: 0 or 1"
-        raise DataError(file, key, message)
-    return array.astype(bool)
 
 
 def _column(array: np.ndarray) -> np.ndarray:

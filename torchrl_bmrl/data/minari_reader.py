@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_bmrl.data.arrays import as_flags, check_finite
 from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
 from torchrl_bmrl.data.hdf5 import (
     DAMAGE,
-    check_finite,
     open_file,
     read_array,
     read_attributes,
@@ -269,9 +269,7 @@ def _check_lengths(path: Path, name: str, arrays: Mapping[str, np.ndarray]) -> i
 def _flags(path: Path, key: str, array: np.ndarray) -> np.ndarray:
     if array.ndim != 1:
         raise DataError(path, key, f"shape {array.shape}; valid: ({len(array)},)")
-    for row in np.flatnonzero((array != 0) & (array != 1)):
-        raise DataError(path, key, f"{array[row]} in row {row}; valid: 0 or 1")
-    return array.astype(bool)
+    return as_flags(path, key, array)
 
 
 def _check_range(path: Path, key: str, actions: np.ndarray, space: Space) -> None:

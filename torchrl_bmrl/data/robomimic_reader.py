@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_bmrl.data.arrays import as_flags, check_finite
 from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
 from torchrl_bmrl.data.hdf5 import (
     DAMAGE,
-    check_finite,
     open_file,
     read_array,
     read_attribute,
@@ -160,7 +160,7 @@ def _read_raw(
         beside += _not_read(path, file, f"{demo}/next_obs", parts)
     if "successes" in present and (extras is None or "successes" in extras):
         steps["successes"] = _read_column(path, file, f"{demo}/successes")
-        _check_flags(path, f"{demo}/successes", steps["successes"])
+        as_flags(path, f"{demo}/successes", steps["successes"])  # kept as they are
     if after is None:
         # What the next observations are made of is to be named as the file has it.
         for part, key in parts.items():
@@ -169,7 +169,7 @@ def _read_raw(
     elif "dones" in steps and steps["dones"].shape != steps["actions"].shape[:1]:
         message = f"shape {steps['dones'].shape}; valid: {steps['actions'].shape[:1]}"
         raise DataError(path, f"{demo}/dones", message)
-    further = {key: steps[key] for key in ("successes",) if key in steps}
+    further = {"successes": steps["successes"]} if "successes" in steps else {}
     for key in present:
         if key in STEP_KEYS or key in further:
             continue
@@ -290,14 +290,7 @@ def _has_rows(path: str | Path, file: h5py.File, key: str, steps: int) -> bool:
 
 
 def _read_flags(path: str | Path, file: h5py.File, key: str) -> np.ndarray:
-    flags = _read_column(path, file, key)
-    _check_flags(path, key, flags)
-    return flags.astype(bool)
-
-
-def _check_flags(path: str | Path, key: str, flags: np.ndarray) -> None:
-    for where in map(tuple, np.argwhere((flags != 0) & (flags != 1))):
-        raise DataError(path, key, f"{flags[where]} in row {where[0]}; valid: 0 or 1")
+    return as_flags(path, key, _read_column(path, file, key))
 
 
 def _read_column(path: str | Path, file: h5py.File, key: str) -> np.ndarray:

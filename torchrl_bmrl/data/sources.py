@@ -276,15 +276,16 @@ def _open_other(stack: ExitStack, path: Path, form: str, options: ReadOptions) -
         told = told["attributes"] | told["metadata"]
     # As gymnasium's environments are in robomimic's layout.
     env_args = {"env_name": told.get("dataset_id", path.stem), "type": 2, "env_kwargs": {}}
-    own = {key: told[key] for key in ("action_bounds",) if form == "minari" and key in told}
     kept = {
         key: value
         for key, value in told.items()
         if key not in _STRUCTURE and _fits_attribute(value)
     }
+    if form == "minari" and "action_bounds" in told:
+        kept["action_bounds"] = told["action_bounds"]
     return _Opened(
         episodes=episodes,
-        metadata={**kept, **own, "env_args": env_args},
+        metadata={**kept, "env_args": env_args},
         oddities=reader.find_oddities(path, **further),
     )
 
