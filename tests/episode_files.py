@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import write_episodes
-from torchrl_bmrl.data.schema import OBSERVATION_SHAPES
+from torchrl_bmrl.data.schema import OBSERVATION_SHAPES, arrays_of
 
 Parts = Mapping[str, tuple[tuple[int, ...], Any]]
 """Shape of a row and dtype of each part of an observation."""
@@ -50,6 +51,28 @@ def make_episode(
             "model_file": f"<mujoco model='{seed}'>{'<geom/>' * 100}</mujoco>",
         },
     )
+
+
+GROUPS = {"obs": "observations", "next_obs": "next_observations"}
+"""Groups of robomimic's layout by the names of an episode's."""
+
+
+def with_array(episode: Episode, key: str, array: Any) -> Episode:
+    """The same episode with another array under a key of robomimic's layout."""
+    group, _, name = key.rpartition("/")
+    if group in GROUPS:
+        parts = {**getattr(episode, GROUPS[group]), name: array}
+        return replace(episode, **{GROUPS[group]: parts})
+    if key in episode.extras:
+        return replace(episode, extras={**episode.extras, key: array})
+    return replace(episode, **{key: array})
+
+
+def changed(key: str, row: int, value: Any) -> Episode:
+    """An episode with another number in a row of an array."""
+    array = arrays_of(make_episode())[key].copy()
+    array.reshape(len(array), -1)[row, -1] = value
+    return with_array(make_episode(), key, array)
 
 
 def write_file(

@@ -6,7 +6,7 @@ import json
 import multiprocessing
 import os
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from episode_files import write_file
 
 from torchrl_bmrl.data.datasets import RobomimicExperienceReplay
 from torchrl_bmrl.data.robomimic import open_episodes, read_metadata
-from torchrl_bmrl.data.schema import summarise
+from torchrl_bmrl.data.summary import summarise
 from torchrl_bmrl.errors import DataError
 
 Outcome = dict[str, Any]
@@ -401,13 +401,11 @@ def mutations() -> list[tuple[str, str, int]]:
     ]
 
 
-def run(folder: str) -> None:
-    """Tries every mutation, each in a line of a file: one that ends the process is the last."""
-    torch.set_num_threads(1)
+def try_all(mutator: Any, mutations: Iterable[tuple[str, str, int]], folder: Path) -> None:
+    """Tries mutations, each in a line of a file: one that ends the process is the last."""
     os.fsync = lambda descriptor: None  # a power cut is not among the mutations
-    mutator = Mutator(Path(folder))
-    with open(Path(folder) / "outcomes.jsonl", "w") as file:
-        for mutation in mutations():
+    with open(folder / "outcomes.jsonl", "w") as file:
+        for mutation in mutations:
             file.write(json.dumps({"mutation": mutation}) + "\n")
             file.flush()
             form, kind, seed = mutation
@@ -418,11 +416,9 @@ def run(folder: str) -> None:
             file.write(json.dumps(outcome) + "\n")
 
 
-@pytest.fixture(scope="module")
-def outcomes(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Any, Outcome]]:
+def outcomes_of(run: Callable[..., None], folder: Path, *further: str) -> list[tuple[Any, Outcome]]:
     """What came of every mutation, in a process that a crash of HDF5 may end."""
-    folder = tmp_path_factory.mktemp("mutations")
-    process = multiprocessing.get_context("spawn").Process(target=run, args=(str(folder),))
+    process = multiprocessing.get_context("spawn").Process(target=run, args=(str(folder), *further))
     process.start()
     process.join(120)
     if process.is_alive():
@@ -434,6 +430,16 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Any, Outcom
         (mutation["mutation"], outcome)
         for mutation, outcome in zip(lines[::2], lines[1::2], strict=True)
     ]
+
+
+def run(folder: str) -> None:
+    torch.set_num_threads(1)
+    try_all(Mutator(Path(folder)), mutations(), Path(folder))
+
+
+@pytest.fixture(scope="module")
+def outcomes(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Any, Outcome]]:
+    return outcomes_of(run, tmp_path_factory.mktemp("mutations"))
 
 
 def test_every_mutated_file_is_refused_by_name_or_loads_correctly(

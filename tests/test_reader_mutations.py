@@ -7,8 +7,6 @@ out is accounted for: steps, reward and successes read and left out are those of
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -21,7 +19,7 @@ pytest.importorskip("h5py")
 pytest.importorskip("minari")
 
 import h5py
-from test_mutations import BYTES, LINK, as_pairs, as_text
+from test_mutations import BYTES, LINK, as_pairs, as_text, outcomes_of, try_all
 
 from torchrl_bmrl.data import d4rl, minari
 from torchrl_bmrl.data.episodes import Episode
@@ -590,19 +588,8 @@ def mutations(layout: Any) -> list[tuple[str, str, int]]:
 
 
 def run(folder: str, name: str) -> None:
-    """Tries every mutation, each in a line of a file: one that ends the process is the last."""
-    os.fsync = lambda fd: None  # a power cut is not among the mutations
     mutator = Mutator(LAYOUTS[name](Path(folder)))
-    with open(Path(folder) / "outcomes.jsonl", "w") as file:
-        for mutation in mutations(mutator.layout):
-            file.write(json.dumps({"mutation": mutation}) + "\n")
-            file.flush()
-            form, kind, seed = mutation
-            try:
-                outcome = getattr(mutator, form)(kind, seed)
-            except Exception as error:
-                outcome = {"outcome": f"{type(error).__name__}: {error}", "wrong": True}
-            file.write(json.dumps(outcome) + "\n")
+    try_all(mutator, mutations(mutator.layout), Path(folder))
 
 
 LAYOUTS: dict[str, Any] = {"minari": Minari, "d4rl": D4rl}
@@ -612,22 +599,7 @@ LAYOUTS: dict[str, Any] = {"minari": Minari, "d4rl": D4rl}
 def outcomes(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> list[tuple[Any, Outcome]]:
-    """What came of every mutation, in a process that a crash of HDF5 may end."""
-    folder = tmp_path_factory.mktemp(request.param)
-    process = multiprocessing.get_context("spawn").Process(
-        target=run, args=(str(folder), request.param)
-    )
-    process.start()
-    process.join(120)
-    if process.is_alive():
-        process.kill()
-        process.join()
-    lines = [json.loads(line) for line in (folder / "outcomes.jsonl").read_text().splitlines()]
-    assert process.exitcode == 0, f"exit code {process.exitcode} in {lines[-1:]}"
-    return [
-        (mutation["mutation"], outcome)
-        for mutation, outcome in zip(lines[::2], lines[1::2], strict=True)
-    ]
+    return outcomes_of(run, tmp_path_factory.mktemp(request.param), request.param)
 
 
 def test_every_mutated_file_is_refused_or_read_to_the_step(

@@ -550,7 +550,8 @@ def test_an_attribute_success_that_contradicts_successes_is_said(
 ) -> None:
     edits = tell("success", True), put("successes", np.zeros(STEPS, bool))
     path = write(tmp_path / "a.hdf5", *edits, next_obs=True)
-    says = "attribute success contradicts successes in 4 episodes; successes are believed"
+    says = "attribute success contradicts successes in 4 episodes, such as demo_0; "
+    says += "successes are believed"
     assert says in checked(path, capsys)[1]
     assert says in load(path).metadata["warnings"]
 

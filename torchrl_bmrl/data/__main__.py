@@ -21,8 +21,8 @@ from torchrl_bmrl.data.convert import TARGETS, convert
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.options import LastStep, ReadOptions, Reward
 from torchrl_bmrl.data.robosuite import Relabelling
-from torchrl_bmrl.data.schema import Summary, summarise
 from torchrl_bmrl.data.sources import Source, open_source
+from torchrl_bmrl.data.summary import Summary, summarise
 from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.progress import progress
 

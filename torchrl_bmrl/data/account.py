@@ -74,13 +74,16 @@ class Account:
         cut: last steps without an observation after them.
         failed: episodes that did not succeed, left out on request.
         arrays: in how many episodes each array or group is left alone.
-        contradictions: episodes whose attribute ``success`` is not what ``successes`` say.
+        contradictions: names of episodes whose attribute ``success`` is not what ``successes`` say.
 
     Example:
         >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.ones(5)
         >>> account = Account()
         >>> account.add(
-        ...     Episode(observations=x, next_observations=x, actions=a, rewards=r, terminated=r > 1)
+        ...     "demo_0",
+        ...     Episode(
+        ...         observations=x, next_observations=x, actions=a, rewards=r, terminated=r > 1
+        ...     ),
         ... )
         >>> print(account.whole)
         1 episodes, 5 steps, reward 5, 0 successes
@@ -90,16 +93,17 @@ class Account:
     cut: Tally = field(default_factory=Tally)
     failed: Tally = field(default_factory=Tally)
     arrays: Counter[str] = field(default_factory=Counter)
-    contradictions: int = 0
+    contradictions: list[str] = field(default_factory=list)
 
-    def add(self, episode: Episode) -> None:
+    def add(self, name: str, episode: Episode) -> None:
         """Counts an episode that was read, and what was left out of it."""
         self.read.include(episode.rewards, episode.succeeded)
         left = episode.left_out
         self.cut += Tally(0, left.steps, left.reward, int(left.reward != 0), int(left.success))
         self.arrays.update(left.arrays)
         said = as_success(episode.attributes.get("success"))
-        self.contradictions += said not in (None, episode.succeeded or left.success)
+        if said not in (None, episode.succeeded or left.success):
+            self.contradictions.append(name)
 
     def add_failure(self, raw: RawEpisode, options: ReadOptions) -> None:
         """Counts an episode that is left out, since it did not succeed."""
@@ -148,8 +152,8 @@ class Account:
             yield f"left out on request, as not successful: {self.failed}"
         if self.contradictions:
             yield (
-                f"attribute success contradicts successes in {self.contradictions} episodes; "
-                "successes are believed"
+                f"attribute success contradicts successes in {len(self.contradictions)} episodes, "
+                f"such as {self.contradictions[0]}; successes are believed"
             )
         if self.arrays:
             named = ", ".join(f"{name} ({count}x)" for name, count in self.arrays.items())

@@ -156,14 +156,14 @@ class _Passing:
                     bounds=source.bounds,
                 )
                 layout = layout or layout_of(episode)
-                self._count(episode)
+                self._count(name, episode)
                 yield episode
                 self.report(1)
         # Before the writer ends, so that nothing is written.
         self.account.check(self.sources[0].path, self.sources[0].options)
 
-    def _count(self, episode: Episode) -> None:
-        self.account.add(episode)
+    def _count(self, name: str, episode: Episode) -> None:
+        self.account.add(name, episode)
         self.extras |= dict.fromkeys(episode.extras)
         self.attributes |= dict.fromkeys(episode.attributes)
         numbers = (episode.actions, episode.rewards, *episode.observations.values())

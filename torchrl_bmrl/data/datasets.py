@@ -334,7 +334,7 @@ def _write_rows(path: Path, source: Source, steps: int) -> TensorDict:
     for number, name in enumerate(source.episodes):
         episode = source.episodes[name]
         check_episode(source.path, f"data/{name}", episode, layout=layout, bounds=source.bounds)
-        source.account.add(episode)
+        source.account.add(name, episode)
         rows = as_tensordict(episode, number=number)
         if layout is None:
             layout = layout_of(episode)

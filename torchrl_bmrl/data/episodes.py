@@ -102,6 +102,8 @@ def as_success(value: Any) -> bool | None:
     """
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
+    if isinstance(value, np.generic):
+        value = value.item()
     if isinstance(value, str):
         value = {"true": True, "false": False}.get(value.lower())
     return bool(value) if isinstance(value, bool | int | float) and value in (0, 1) else None

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchrl_bmrl.data.episodes import Episode
+from torchrl_bmrl.data.episodes import Episode, as_success
 
 FROZEN_STEPS = 10
 """So many observations in a row are equal to the bit by no accident.
@@ -66,7 +66,7 @@ class Oddities:
     def __init__(self) -> None:
         self._count = 0
         self._frozen, self._idle, self._foreign = _Found(), _Found(), _Found()
-        self._successes, self._rewards = _Found(), _Found()
+        self._rewards = _Found()
         self._still: dict[str, _Found] = {}
         self._varied: dict[str, int] = {}
         self._steps, self._reward = 0, 0.0
@@ -96,24 +96,17 @@ class Oddities:
         if self._last is not None and _is_foreign(self._last[1], episode):
             self._foreign.episodes[self._last[0]] = f"{name} follows"
         self._last = (name, episode)
-        self._look_at_success(name, episode)
+        self._look_at_rewards(name, episode)
 
-    def _look_at_success(self, name: str, episode: Episode) -> None:
+    def _look_at_rewards(self, name: str, episode: Episode) -> None:
         earned = bool(np.any(episode.rewards)) or episode.left_out.reward != 0
         self._steps += len(episode)
         self._reward += float(np.sum(episode.rewards)) + episode.left_out.reward
         self._sparse &= bool(np.isin(episode.rewards, (0, 1)).all())
-        success = episode.attributes.get("success")
-        if not isinstance(success, bool | int | np.bool_ | np.integer):
-            return
-        said = f"success is {int(success)}"
-        if "successes" in episode.extras:
-            solved = bool(np.any(episode.extras["successes"])) or episode.left_out.success
-            if solved != bool(success):
-                where = "solved at a step" if solved else "solved at none"
-                self._successes.episodes[name] = f"{said}, {where}"
-        if earned != bool(success):
-            self._rewards.episodes[name] = f"{said}, {'a' if earned else 'no'} reward"
+        success = as_success(episode.attributes.get("success"))
+        if success is not None and earned != success:
+            said = f"success is {int(success)}, {'a' if earned else 'no'} reward"
+            self._rewards.episodes[name] = said
 
     def warnings(self) -> list[str]:
         """What was found: how often, an example, and what it may mean."""
@@ -143,11 +136,6 @@ class Oddities:
                 f"in {len(foreign)} {of} the last next observation is the first observation of the "
                 f"next episode in the file: {self._foreign.names()}. It was probably not recorded, "
                 "as in D4RL's files: values would be bootstrapped from another episode"
-            )
-        if found := self._successes.episodes:
-            yield (
-                f"in {len(found)} {of} the attribute success contradicts successes, such as "
-                f"{self._successes.example()}: which of them is right?"
             )
         # Other rewards than a 1 where the task is solved say nothing of success.
         sparse = self._sparse and 0 < self._reward < self._steps / 2
