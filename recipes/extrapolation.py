@@ -302,8 +302,6 @@ def check_settings(settings: Settings) -> None:
     Raises:
         BMRLError: naming the setting, its value and what is valid.
     """
-    if not settings.run_dir:
-        raise ConfigError("run_dir is ''; valid: a folder, . for the one that one is in")
     envs = [
         name
         for name, spec in gymnasium.registry.items()

@@ -33,9 +33,11 @@ def with_folders_settings(settings: DictConfig) -> DictConfig:
         settings: as composed of the command line and the preset.
 
     Raises:
-        BMRLError: if the command gives another preset or ablation, with other settings, or the
-            folder's are damaged.
+        BMRLError: if the folder has no name, the command gives another preset or ablation, with
+            other settings, or the folder's are damaged.
     """
+    if not settings.run_dir:
+        raise ConfigError("run_dir is ''; valid: a folder, . for the one that one is in")
     given, run_dir = _given(settings), Path(settings.run_dir)
     if not given.get("run_dir") or not (run_dir / "config.yaml").exists():
         return settings

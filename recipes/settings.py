@@ -310,8 +310,6 @@ def check_settings(config: Config, *, device: bool = True) -> None:
     Raises:
         BMRLError: naming the key, its value and what is valid.
     """
-    if not config.run_dir:
-        raise ConfigError("run_dir is ''; valid: a folder, . for the one that one is in")
     for task in [*config.tasks, *config.collect.train_episodes, config.interpolation.task]:
         check_task(task)
     missing = [task for task in config.tasks if task not in config.collect.train_episodes]

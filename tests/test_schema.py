@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("h5py")
 
-from episode_files import changed, make_episode, with_array
+from episode_files import PARTS, changed, make_episode, with_array
 
 from torchrl_bmrl.data.episodes import RESERVED, Episode
 from torchrl_bmrl.data.schema import (
