@@ -310,11 +310,21 @@ def refused() -> dict[str, tuple[Callable[[], Any], dict[str, Any], str]]:
             {"loc": LOC, "scale": SCALE, "observation_key": "pixels"},
             r"observation_key is 'pixels'; valid: what the policy reads, \['observation'\]",
         ),
+        "zero": (
+            bcq,
+            {"loc": LOC, "scale": torch.zeros_like(SCALE)},
+            "scale is .*; valid: finite numbers above 0",
+        ),
+        "infinite": (
+            bcq,
+            {"loc": LOC, "scale": SCALE / 0.0},
+            "scale is .*inf.*; valid: finite numbers above 0",
+        ),
         "latent": (lambda: BCQPolicy(NoLatent(), critic), {}, "NoLatent has no 'decode'"),
     }
 
 
-@pytest.mark.parametrize("case", ["half", "key", "latent"])
+@pytest.mark.parametrize("case", ["half", "key", "zero", "infinite", "latent"])
 def test_what_cannot_be_written_is_refused(case: str, tmp_path: Path) -> None:
     make, options, message = refused()[case]
     with pytest.raises(BMRLError, match=message):
