@@ -49,21 +49,21 @@ _NEEDS = {
     "matplotlib": ["tests/published_data.py", "torchrl_bmrl/reports/*"],
     "minari": ["torchrl_bmrl/data/convert.py"],
     "mujoco": ["torchrl_bmrl/reports/films.py"],
-    "onnxscript": ["torchrl_bmrl/export.py"],
+    "onnxscript": ["torchrl_bmrl/pipeline/export.py"],
     "robosuite": [
         "torchrl_bmrl/envs/*",
         "torchrl_bmrl/evaluation/rollout.py",
         "torchrl_bmrl/experts/*",
     ],
-    "safetensors": ["torchrl_bmrl/agents.py", "torchrl_bmrl/checkpoint.py"],
+    "safetensors": ["torchrl_bmrl/pipeline/agents.py", "torchrl_bmrl/training/checkpoint.py"],
     "scipy": ["torchrl_bmrl/evaluation/*", "torchrl_bmrl/reports/*"],
     "sklearn": ["torchrl_bmrl/evaluation/embedding.py", "torchrl_bmrl/reports/figures.py"],
     "tqdm": [
         "torchrl_bmrl/data/__main__.py",
-        "torchrl_bmrl/parallel.py",
-        "torchrl_bmrl/progress.py",
+        "torchrl_bmrl/run/workers.py",
+        "torchrl_bmrl/run/progress.py",
     ],
-    "yaml": ["torchrl_bmrl/runs.py"],
+    "yaml": ["torchrl_bmrl/run/folder.py"],
 }
 collect_ignore_glob = sorted(
     {glob for package, globs in _NEEDS.items() if find_spec(package) is None for glob in globs}

@@ -18,13 +18,13 @@ from matplotlib.patches import FancyBboxPatch
 from PIL import Image
 from tensordict import TensorDict
 
-from torchrl_bmrl.agents import load_student
-from torchrl_bmrl.checkpoint import load_checkpoint
 from torchrl_bmrl.envs.rendering import render_states
 from torchrl_bmrl.experts.collect import collect_episode
 from torchrl_bmrl.experts.controllers import ExpertGains
 from torchrl_bmrl.names import TASKS
+from torchrl_bmrl.pipeline.agents import load_student
 from torchrl_bmrl.reports import TASK_COLORS, embedding_scatter, task_name
+from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 DOCS = Path(__file__).parent
 POLICY = DOCS.parent / "recipes" / "policies" / "sawyer.safetensors"

@@ -40,14 +40,14 @@ from torchrl_bmrl.evaluation import (
     write_results,
 )
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
-from torchrl_bmrl.health import check_metrics
 from torchrl_bmrl.names import TASKS, horizon_of
-from torchrl_bmrl.parallel import Report, run_jobs
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
 from torchrl_bmrl.reports.tables import MISSING, Table, policy_name, task_name
-from torchrl_bmrl.runs import close_logger, log_metrics, make_logger, open_run
+from torchrl_bmrl.run.folder import close_logger, log_metrics, make_logger, open_run
+from torchrl_bmrl.run.workers import Report, run_jobs
 from torchrl_bmrl.training import keep_freed_memory
+from torchrl_bmrl.training.health import check_metrics
 
 Job = tuple[Config, str, str]
 """Settings, algorithm, and task or :data:`ALL_TASKS`."""

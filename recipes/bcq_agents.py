@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +12,21 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
-from torchrl_bmrl.agents import make_bcq_loss
-from torchrl_bmrl.checkpoint import (
+from torchrl_bmrl.envs.transforms import ObservationStatistics
+from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.objectives import BCQLoss, StackedLoss
+from torchrl_bmrl.pipeline.agents import make_bcq_loss
+from torchrl_bmrl.run.workers import derive_seed
+from torchrl_bmrl.training import make_adam
+from torchrl_bmrl.training.checkpoint import (
     keep_training,
     load_checkpoint,
     resume_training,
     save_checkpoint,
 )
-from torchrl_bmrl.envs.transforms import ObservationStatistics
-from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.health import check_metrics, check_proposals, value_limits
-from torchrl_bmrl.messages import say
-from torchrl_bmrl.objectives import BCQLoss, StackedLoss
-from torchrl_bmrl.parallel import derive_seed
-from torchrl_bmrl.training import make_adam
+from torchrl_bmrl.training.health import check_metrics, check_proposals, value_limits
+
+log = logging.getLogger("torchrl_bmrl.recipes")
 
 LOSS_SETTINGS = (
     "num_cells",
@@ -116,7 +118,7 @@ class Agents:
                 self.diverged[name] = str(error)
                 if not self.well:
                     raise
-                say(f"{error}; it is frozen and the others go on")
+                log.warning(f"{error}; it is frozen and the others go on")
                 del rows[name]
         return rows
 

@@ -23,24 +23,24 @@ from settings import Config, deciding_settings, run_recipe, tell
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_bmrl.agents import Student, load_bcq_loss, make_distillation_loss
-from torchrl_bmrl.checkpoint import keep_training, resume_training
 from torchrl_bmrl.data import make_multi_task_replay_buffer, with_previous
 from torchrl_bmrl.data.demonstrations import load_transitions, read_statistics
 from torchrl_bmrl.errors import StoppedError
 from torchrl_bmrl.functional import nonzero_scale, sample_action_latent
-from torchrl_bmrl.health import check_metrics, check_proposals
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.objectives import BCQLoss
-from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
-from torchrl_bmrl.runs import close_logger, log_metrics, make_logger
+from torchrl_bmrl.pipeline.agents import Student, load_bcq_loss, make_distillation_loss
+from torchrl_bmrl.run.folder import close_logger, log_metrics, make_logger
+from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
 from torchrl_bmrl.training import (
     accelerate,
     gradient_step,
     keep_freed_memory,
     make_adam,
 )
+from torchrl_bmrl.training.checkpoint import keep_training, resume_training
+from torchrl_bmrl.training.health import check_metrics, check_proposals
 
 LOSS_SETTINGS = (
     "context",

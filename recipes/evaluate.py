@@ -28,8 +28,6 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.transforms import Transform
 
-from torchrl_bmrl.agents import Student, load_bcq_loss, load_student
-from torchrl_bmrl.checkpoint import load_checkpoint
 from torchrl_bmrl.data.demonstrations import (
     demonstration_path,
     load_transitions,
@@ -45,10 +43,12 @@ from torchrl_bmrl.experts.collect import collect_episode
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.names import TASKS, horizon_of
-from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
+from torchrl_bmrl.pipeline.agents import Student, load_bcq_loss, load_student
 from torchrl_bmrl.reports import Embeddings, write_report
 from torchrl_bmrl.reports.films import explore_demonstrations
-from torchrl_bmrl.runs import read_versions
+from torchrl_bmrl.run.folder import read_versions
+from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
+from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 
 def keep_rows(

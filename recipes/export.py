@@ -24,16 +24,16 @@ from omegaconf import DictConfig
 from settings import Config, run_recipe
 from tensordict import TensorDict
 
-from torchrl_bmrl.agents import ACTION_DIM, Student, load_student
-from torchrl_bmrl.checkpoint import save_checkpoint
 from torchrl_bmrl.data.demonstrations import load_transitions
 from torchrl_bmrl.envs.transforms import ObservationStatistics
 from torchrl_bmrl.evaluation import read_results, summarise
-from torchrl_bmrl.export import export_policy
 from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
+from torchrl_bmrl.pipeline.agents import ACTION_DIM, Student, load_student
+from torchrl_bmrl.pipeline.export import export_policy
 from torchrl_bmrl.reports.tables import results_table
-from torchrl_bmrl.runs import read_versions
+from torchrl_bmrl.run.folder import read_versions
+from torchrl_bmrl.training.checkpoint import save_checkpoint
 
 CARD = """# The distilled policy of preset {preset}, seed {seed}
 

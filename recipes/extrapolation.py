@@ -50,16 +50,16 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import LossModule, SoftUpdate, TD3Loss
 
-from torchrl_bmrl.checkpoint import load_checkpoint, save_checkpoint
-from torchrl_bmrl.command_line import exit_codes
 from torchrl_bmrl.errors import ConfigError, UnknownNameError
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
 from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import finite, read_rows, whole, write_atomic, write_rows
 from torchrl_bmrl.functional import nonzero_scale
-from torchrl_bmrl.health import check_metrics
-from torchrl_bmrl.locks import hold_run
-from torchrl_bmrl.parallel import Report, available_cores, derive_seed, run_jobs
+from torchrl_bmrl.run.command_line import exit_codes
+from torchrl_bmrl.run.locks import hold_run
+from torchrl_bmrl.run.workers import Report, available_cores, derive_seed, run_jobs
+from torchrl_bmrl.training.checkpoint import load_checkpoint, save_checkpoint
+from torchrl_bmrl.training.health import check_metrics
 
 with needs("robosuite"):
     import gymnasium

@@ -34,22 +34,22 @@ from torch import nn
 from torchrl.objectives import SoftUpdate
 from train_bcq import choose_updates
 
-from torchrl_bmrl.agents import ACTION_DIM, OBSERVATION_DIM, load_bcq_loss
-from torchrl_bmrl.checkpoint import save_checkpoint
 from torchrl_bmrl.data import make_replay_buffer
 from torchrl_bmrl.data.demonstrations import load_transitions, read_statistics
 from torchrl_bmrl.evaluation import rank_correlation
 from torchrl_bmrl.files import finite, read_rows, whole, write_rows
-from torchrl_bmrl.health import check_metrics
 from torchrl_bmrl.modules import BCQPolicy, make_qvalue_network
 from torchrl_bmrl.names import horizon_of
 from torchrl_bmrl.objectives import FQELoss
-from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
+from torchrl_bmrl.pipeline.agents import ACTION_DIM, OBSERVATION_DIM, load_bcq_loss
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
 from torchrl_bmrl.reports.tables import Table, task_name
-from torchrl_bmrl.runs import open_run
+from torchrl_bmrl.run.folder import open_run
+from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
 from torchrl_bmrl.training import gradient_step, keep_freed_memory, make_adam
+from torchrl_bmrl.training.checkpoint import save_checkpoint
+from torchrl_bmrl.training.health import check_metrics
 
 Job = tuple[Config, str]
 Rows = list[dict[str, Any]]

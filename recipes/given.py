@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from contextlib import suppress
 from copy import deepcopy
@@ -14,8 +15,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_bmrl.errors import ConfigError
-from torchrl_bmrl.messages import say
-from torchrl_bmrl.runs import deciding, flat, read_settings
+from torchrl_bmrl.run.folder import deciding, flat, read_settings
+
+log = logging.getLogger("torchrl_bmrl.recipes")
 
 CHOICES = ("preset", "ablation")
 """Names of many settings."""
@@ -62,7 +64,7 @@ def with_folders_settings(settings: DictConfig) -> DictConfig:
                 by_task = bool(group) and OmegaConf.get_type(OmegaConf.select(taken, group)) is dict
                 OmegaConf.update(taken, key, value, force_add=by_task)
     if taken != settings:
-        say(f"{run_dir}: settings that were not given are those of its config.yaml")
+        log.info(f"{run_dir}: settings that were not given are those of its config.yaml")
     return taken
 
 

@@ -30,7 +30,6 @@ from torch.nn.functional import mse_loss
 from torchrl.envs.transforms import StepCounter, Transform
 from torchrl.modules import MLP
 
-from torchrl_bmrl.agents import load_student
 from torchrl_bmrl.data.demonstrations import read_statistics
 from torchrl_bmrl.data.episodes import as_tensordict
 from torchrl_bmrl.data.robomimic import keep_episode, read_kept_episode
@@ -48,12 +47,13 @@ from torchrl_bmrl.files import read_rows, whole, write_rows
 from torchrl_bmrl.modules import DemonstrationTaskLatent, StageTaskLatent
 from torchrl_bmrl.modules.task_latent import ALIGNMENTS
 from torchrl_bmrl.names import composition_stages, horizon_of
-from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
-from torchrl_bmrl.progress import progress
+from torchrl_bmrl.pipeline.agents import load_student
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
 from torchrl_bmrl.reports.tables import Table, task_name
-from torchrl_bmrl.runs import open_run
+from torchrl_bmrl.run.folder import open_run
+from torchrl_bmrl.run.progress import progress
+from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
 
 METHODS = (*(f"demonstration, by {name}" for name in ALIGNMENTS), "task index", "cloning", "replay")
 PERTURBATIONS = ("none", "magnitude", "direction", "both", "both, constant")

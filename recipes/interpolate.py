@@ -41,7 +41,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_bmrl.agents import Student, load_student
 from torchrl_bmrl.data.demonstrations import load_transitions, read_statistics
 from torchrl_bmrl.envs.transforms import make_env
 from torchrl_bmrl.errors import ConfigError
@@ -51,8 +50,9 @@ from torchrl_bmrl.evaluation.rollout import rollout_episodes
 from torchrl_bmrl.files import number, read_rows, whole, write_rows
 from torchrl_bmrl.modules import BCQPolicy, PathTaskLatent
 from torchrl_bmrl.names import horizon_of
-from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
+from torchrl_bmrl.pipeline.agents import Student, load_student
 from torchrl_bmrl.reports import Section, write_study
+from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
 
 WITH_NOISE = ("straight", "random")
 """Methods beside which action noise of the same size is played."""

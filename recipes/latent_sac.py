@@ -34,18 +34,18 @@ from torchrl.envs import set_exploration_type as exploring
 from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from torchrl_bmrl.agents import load_student
 from torchrl_bmrl.data.demonstrations import load_transitions, read_statistics
 from torchrl_bmrl.envs.transforms import StageReward, make_env
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
 from torchrl_bmrl.files import finite, read_rows, whole, write_rows
-from torchrl_bmrl.health import check_metrics
 from torchrl_bmrl.modules import HeldTaskLatent, task_latent_box
 from torchrl_bmrl.modules.generator import Network, make_mlp
 from torchrl_bmrl.names import composition_stages, horizon_of
-from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
+from torchrl_bmrl.pipeline.agents import load_student
 from torchrl_bmrl.reports import Picture, Section, Table, success_curves, write_study
-from torchrl_bmrl.runs import open_run
+from torchrl_bmrl.run.folder import open_run
+from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
+from torchrl_bmrl.training.health import check_metrics
 
 VARIANTS = ("latent", "raw")
 """What the agent's action is: m, or the robot's."""

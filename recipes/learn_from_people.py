@@ -27,7 +27,6 @@ from omegaconf import DictConfig
 from settings import Config, run_recipe
 from train_bcq import train_agents
 
-from torchrl_bmrl.agents import load_bcq_loss
 from torchrl_bmrl.data import make_mixed_replay_buffer
 from torchrl_bmrl.data.convert import convert, find_format
 from torchrl_bmrl.data.demonstrations import load_transitions, read_demonstrations, read_statistics
@@ -38,8 +37,9 @@ from torchrl_bmrl.evaluation.rollout import evaluate_policy
 from torchrl_bmrl.files import finite, read_rows, whole, write_atomic, write_rows
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.names import horizon_of
-from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
-from torchrl_bmrl.progress import progress
+from torchrl_bmrl.pipeline.agents import load_bcq_loss
+from torchrl_bmrl.run.progress import progress
+from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
 
 TASK = "lift"
 Job = tuple[Config, float, int]

@@ -19,15 +19,15 @@ from torchrl.envs.transforms import CatTensors, Transform
 from torchrl.objectives import CQLLoss, LossModule, SoftUpdate
 from train_bcq import choose_updates
 
-from torchrl_bmrl.agents import ACTION_DIM, OBSERVATION_DIM, make_bcq_loss
-from torchrl_bmrl.checkpoint import keep_training, resume_training
 from torchrl_bmrl.modules import BCQPolicy, PrototypeTaskLatent
-from torchrl_bmrl.parallel import derive_seed
+from torchrl_bmrl.pipeline.agents import ACTION_DIM, OBSERVATION_DIM, make_bcq_loss
+from torchrl_bmrl.run.workers import derive_seed
 from torchrl_bmrl.training import (
     Update,
     gradient_step,
     make_adam,
 )
+from torchrl_bmrl.training.checkpoint import keep_training, resume_training
 
 BUILDERS = {build.__name__: build for build in (bc, td3_bc, iql, cql)}
 ONE_HOT = "bcq_one_hot"

@@ -27,8 +27,6 @@ import settings as recipe_settings  # noqa: F401 -- registers what recipe.yaml b
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_bmrl.checkpoint import load_checkpoint
-from torchrl_bmrl.command_line import exit_codes
 from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.evaluation import read_results
 from torchrl_bmrl.files import read_json
@@ -41,7 +39,9 @@ from torchrl_bmrl.reports.published import (
     read_published,
     write_published,
 )
-from torchrl_bmrl.runs import deciding, read_settings, read_versions
+from torchrl_bmrl.run.command_line import exit_codes
+from torchrl_bmrl.run.folder import deciding, read_settings, read_versions
+from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 RECIPES = Path(__file__).resolve().parent
 STAGES = ("collect", "stage 1", "stage 2", "evaluate")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import logging
 import math
 import sys
 from collections.abc import Callable
@@ -15,21 +16,23 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from torchrl_bmrl.agents import LATENT_SOURCES, TASK_ENCODERS
-from torchrl_bmrl.command_line import exit_codes
 from torchrl_bmrl.data.replay import check_device
 from torchrl_bmrl.errors import ConfigError, UnknownNameError
 from torchrl_bmrl.experts.controllers import ExpertGains
-from torchrl_bmrl.locks import hold_run
-from torchrl_bmrl.messages import say
 from torchrl_bmrl.names import STEPPERS, TASKS, check_task, composition_stages
 from torchrl_bmrl.objectives.bcq import TARGET_DTYPES
 from torchrl_bmrl.objectives.checks import check_value_bounds
 from torchrl_bmrl.objectives.common import LOSS_FUNCTIONS
 from torchrl_bmrl.objectives.distillation import CONTEXTS, ENCODER_TERMS
 from torchrl_bmrl.objectives.generative import KL_REDUCTIONS
-from torchrl_bmrl.parallel import available_cores
-from torchrl_bmrl.runs import LOGGERS, deciding
+from torchrl_bmrl.pipeline.agents import LATENT_SOURCES, TASK_ENCODERS
+from torchrl_bmrl.run.command_line import exit_codes
+from torchrl_bmrl.run.folder import LOGGERS, deciding
+from torchrl_bmrl.run.locks import hold_run
+from torchrl_bmrl.run.logs import log_to_stderr
+from torchrl_bmrl.run.workers import available_cores
+
+log = logging.getLogger("torchrl_bmrl.recipes")
 
 BASELINES = ("bc", "td3_bc", "iql", "cql", "bcq_one_hot")
 
@@ -402,9 +405,8 @@ OUT_OF_MEMORY = (
 
 
 def tell(config: Config, message: str) -> None:
-    """Says what only those want to know who asked for it, with ``verbose``."""
-    if config.verbose:
-        say(message)
+    """Logs what only ``verbose`` shows."""
+    log.debug(message)
 
 
 def run_recipe(
@@ -424,6 +426,7 @@ def run_recipe(
     """
     with exit_codes(out_of_memory=OUT_OF_MEMORY):
         try:
+            log_to_stderr(verbose=settings.verbose is True)
             composed, settings = settings, with_folders_settings(settings)
             config = OmegaConf.to_object(settings)
         except OmegaConfBaseException as error:  # a reference to nothing, say

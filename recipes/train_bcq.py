@@ -36,8 +36,8 @@ from torchrl_bmrl.errors import BMRLError, StoppedError
 from torchrl_bmrl.evaluation.rollout import evaluate_policy
 from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.modules import BCQPolicy
-from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
-from torchrl_bmrl.runs import close_logger, log_metrics, make_logger
+from torchrl_bmrl.run.folder import close_logger, log_metrics, make_logger
+from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
 from torchrl_bmrl.training import (
     Update,
     accelerate,

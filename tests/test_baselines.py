@@ -24,10 +24,10 @@ from small_runs import HORIZON, RECIPES, configured
 from tensordict import TensorDict
 
 from torchrl_bmrl import names
-from torchrl_bmrl.agents import ACTION_DIM, OBSERVATION_DIM
-from torchrl_bmrl.checkpoint import load_checkpoint
 from torchrl_bmrl.evaluation import ResultRow, read_results, rollout, write_results
-from torchrl_bmrl.parallel import derive_seed
+from torchrl_bmrl.pipeline.agents import ACTION_DIM, OBSERVATION_DIM
+from torchrl_bmrl.run.workers import derive_seed
+from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 pytestmark = pytest.mark.robosuite
 

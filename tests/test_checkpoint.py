@@ -18,16 +18,16 @@ from torch import Tensor, nn
 
 pytest.importorskip("safetensors")
 
-from torchrl_bmrl.agents import Student, load_bcq_loss, load_student, make_bcq_loss
-from torchrl_bmrl.checkpoint import (
+from torchrl_bmrl.errors import CheckpointError
+from torchrl_bmrl.modules import BCQPolicy
+from torchrl_bmrl.pipeline.agents import Student, load_bcq_loss, load_student, make_bcq_loss
+from torchrl_bmrl.training.checkpoint import (
     earlier,
     load_checkpoint,
     load_newest,
     load_state,
     save_checkpoint,
 )
-from torchrl_bmrl.errors import CheckpointError
-from torchrl_bmrl.modules import BCQPolicy
 
 META = {"kind": "example", "epochs": 3, "tasks": ["reach", "σ"], "loss": {"clip": None, "lr": 1e-5}}
 SAID = {
@@ -221,7 +221,9 @@ def test_killed_while_it_rotates_the_newest_one_is_there(
 ) -> None:
     keep_four(path, 3)
     with monkeypatch.context() as patch:
-        patch.setattr(f"torchrl_bmrl.checkpoint.{moment}", Mock(side_effect=KeyboardInterrupt))
+        patch.setattr(
+            f"torchrl_bmrl.training.checkpoint.{moment}", Mock(side_effect=KeyboardInterrupt)
+        )
         with pytest.raises(KeyboardInterrupt):
             save_checkpoint(path, {"step": 4}, META, keep=3)
     found = load_newest(path, kind="example")
@@ -406,7 +408,7 @@ def with_header(path: Path, header: Any) -> None:
     """Writes a checkpoint whose header says this, its checksum right if it has a place for one."""
     from safetensors.torch import save
 
-    from torchrl_bmrl import checkpoint
+    from torchrl_bmrl.training import checkpoint
 
     tensors = {"/a": torch.ones(2)}
     if isinstance(header, dict):

@@ -50,7 +50,7 @@ def test_links_to_files_lead_somewhere(page: Path) -> None:
 
 def test_the_page_of_runs_names_every_setting_that_is_free_to_change() -> None:
     pytest.importorskip("yaml")
-    from torchrl_bmrl.runs import FREE_TO_CHANGE
+    from torchrl_bmrl.run.folder import FREE_TO_CHANGE
 
     text = (ROOT / "docs" / "runs.md").read_text()
     _, _, rest = text.partition("Free to change are ")

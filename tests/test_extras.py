@@ -181,8 +181,8 @@ def test_the_core_imports_with_everything_hidden_and_the_rest_does_not(told: Any
     failed = told("everything")
     core = ("objectives", "modules", "data", "data.replay", "data.episodes", "functional")
     assert not {f"torchrl_bmrl.{name}" for name in core} & failed.keys()
-    rest = ("agents", "checkpoint", "configs", "data.hdf5", "envs", "envs.sawyer", "parallel")
-    assert {f"torchrl_bmrl.{name}" for name in (*rest, "reports", "runs")} <= failed.keys()
+    rest = ("pipeline.agents", "training.checkpoint", "configs", "data.hdf5", "envs.sawyer")
+    assert {f"torchrl_bmrl.{name}" for name in (*rest, "reports", "run.folder")} <= failed.keys()
 
 
 COMMANDS = sorted(
@@ -231,7 +231,7 @@ def test_a_recipe_without_one_of_its_packages_is_one_line(package: str) -> None:
 
 
 def test_another_error_of_a_command_keeps_its_traceback() -> None:
-    done = run("import torchrl_bmrl.as_command\n1 / 0")
+    done = run("import torchrl_bmrl.run.as_command\n1 / 0")
     assert done.returncode == 1
     assert "Traceback" in done.stderr
     assert "ZeroDivisionError" in done.stderr

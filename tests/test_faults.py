@@ -22,10 +22,10 @@ pytest.importorskip("tqdm")
 
 from small_runs import Run, contents, times
 
-from torchrl_bmrl import parallel
-from torchrl_bmrl.checkpoint import load_checkpoint
-from torchrl_bmrl.locks import hold
-from torchrl_bmrl.progress import Lines
+from torchrl_bmrl.run import workers as parallel
+from torchrl_bmrl.run.locks import hold
+from torchrl_bmrl.run.progress import Lines
+from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 pytestmark = [pytest.mark.robosuite, pytest.mark.slow]
 STAGES = ("bcq/*/*", "distill/*", "results.csv", "tables/*", "logs/*/scalars/*")

@@ -20,8 +20,8 @@ pytest.importorskip("tqdm")
 from omegaconf import OmegaConf
 from small_runs import Run, configured, contents
 
-from torchrl_bmrl.checkpoint import load_checkpoint
 from torchrl_bmrl.errors import ConfigError
+from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 SERIES = ["fqe.checkpoints=[3,6,12]", "fqe.updates=8", "fqe.num_candidates=3"]
 UPDATES = [3, 6, 12]

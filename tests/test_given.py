@@ -21,8 +21,8 @@ import yaml
 from small_runs import RECIPES, SMALL, command_line, configured, contents
 
 from torchrl_bmrl.errors import ConfigError
-from torchrl_bmrl.locks import hold, hold_run
-from torchrl_bmrl.runs import open_run, read_settings
+from torchrl_bmrl.run.folder import open_run, read_settings
+from torchrl_bmrl.run.locks import hold, hold_run
 
 MADE = ("preset=paper", "ablation=dim4", "seed=3", "bcq.lr=1e-4", "imitate.episodes=10")
 MADE += ("collect.after.lift=['',reach]", "workers=7", "verbose=true", "device=cuda")
@@ -202,7 +202,7 @@ def test_the_extrapolation_experiment_knows_its_folder_too(
         raise ConfigError("that was all")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("torchrl_bmrl.parallel.run_jobs", stop)
+        patch.setattr("torchrl_bmrl.run.workers.run_jobs", stop)
         assert command_line("extrapolation", f"run_dir={tmp_path / 'run'}", "workers=1") == 1
     assert (ran[0].seeds, ran[0].updates, ran[0].workers) == ([4], 7, 1)
     assert command_line("extrapolation", f"run_dir={tmp_path / 'run'}", "updates=8") == 1

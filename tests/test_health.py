@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.health import check_metrics, check_proposals, value_limits
+from torchrl_bmrl.training.health import check_metrics, check_proposals, value_limits
 
 WHERE = "bcq lift, update 100"
 

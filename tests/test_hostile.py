@@ -34,22 +34,21 @@ from omegaconf.errors import OmegaConfBaseException
 from safetensors.torch import load, save
 from small_runs import configured
 
-from torchrl_bmrl import checkpoint
-from torchrl_bmrl.agents import (
-    Student,
-    load_bcq_loss,
-    load_student,
-    make_bcq_loss,
-    make_distillation_loss,
-)
 from torchrl_bmrl.data.demonstrations import read_statistics
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import keep_episode, read_kept_episode
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
 from torchrl_bmrl.modules import BCQPolicy
-from torchrl_bmrl.runs import deciding, open_run, read_settings, read_versions
-from torchrl_bmrl.training import make_adam
+from torchrl_bmrl.pipeline.agents import (
+    Student,
+    load_bcq_loss,
+    load_student,
+    make_bcq_loss,
+    make_distillation_loss,
+)
+from torchrl_bmrl.run.folder import deciding, open_run, read_settings, read_versions
+from torchrl_bmrl.training import checkpoint, make_adam
 
 TRIED = settings(
     max_examples=120,

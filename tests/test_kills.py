@@ -27,9 +27,9 @@ pytest.importorskip("tqdm")
 
 from small_runs import RECIPES, SMALL, contents, short_episodes
 
-from torchrl_bmrl.checkpoint import load_checkpoint
 from torchrl_bmrl.data.robomimic import open_episodes, read_kept_episode
 from torchrl_bmrl.evaluation import read_results
+from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 pytestmark = [pytest.mark.robosuite, pytest.mark.slow, pytest.mark.timeout(0)]
 KILLS = int(os.environ.get("BMRL_KILLS", "0"))

@@ -17,12 +17,12 @@ pytest.importorskip("filelock")
 pytest.importorskip("yaml")
 
 from torchrl_bmrl.errors import FolderInUseError
-from torchrl_bmrl.locks import hold
+from torchrl_bmrl.run.locks import hold
 
 HOLDING = """
 import sys
 from pathlib import Path
-from torchrl_bmrl.locks import hold
+from torchrl_bmrl.run.locks import hold
 with hold(Path(sys.argv[1]), sys.argv[2:]):
     print("held", flush=True)
     sys.stdin.read()

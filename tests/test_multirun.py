@@ -123,9 +123,9 @@ def test_a_job_that_is_asked_to_stop_stops_the_sweep(
 RECIPE = f"""
 import os, signal, time
 import hydra, settings
-from torchrl_bmrl.command_line import exit_codes
+from torchrl_bmrl.run.command_line import exit_codes
 from torchrl_bmrl.errors import ConfigError
-from torchrl_bmrl.messages import say
+from torchrl_bmrl.run.logs import write_line
 
 @hydra.main(version_base="1.3", config_path={str(RECIPES / "config")!r}, config_name="recipe")
 def main(config):

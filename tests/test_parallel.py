@@ -17,7 +17,6 @@ import torch
 
 pytest.importorskip("tqdm")
 
-from torchrl_bmrl import parallel
 from torchrl_bmrl.errors import (
     BMRLError,
     CheckpointError,
@@ -26,9 +25,10 @@ from torchrl_bmrl.errors import (
     StoppedError,
     UnknownNameError,
 )
-from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
-from torchrl_bmrl.progress import Lines
-from torchrl_bmrl.stops import stop_on_signals
+from torchrl_bmrl.run import workers as parallel
+from torchrl_bmrl.run.progress import Lines
+from torchrl_bmrl.run.stops import stop_on_signals
+from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
 
 OPTIONS: dict[str, Any] = {"total": 8, "description": "stage 1: training", "unit": "update"}
 

@@ -18,10 +18,10 @@ pytest.importorskip("tqdm")
 
 from tqdm import tqdm
 
-from torchrl_bmrl import progress as module
-from torchrl_bmrl.messages import say
-from torchrl_bmrl.parallel import Report
-from torchrl_bmrl.progress import Lines, progress
+from torchrl_bmrl.run import progress as module
+from torchrl_bmrl.run.logs import write_line
+from torchrl_bmrl.run.progress import Lines, progress
+from torchrl_bmrl.run.workers import Report
 
 OPTIONS: dict[str, Any] = {"total": 400, "description": "stage 1: training", "unit": "update"}
 LINE = re.compile(
@@ -132,7 +132,7 @@ def test_messages_and_lines_of_threads_stay_whole(
 
     def talk(name: str) -> None:
         for _ in range(200):
-            say(name * 40)
+            write_line(name * 40)
 
     threads = [threading.Thread(target=talk, args=(name,)) for name in "abc"]
     with progress(**OPTIONS):
@@ -155,12 +155,12 @@ def test_a_log_that_nobody_takes_ends_no_run(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(module, "SOON", 0.01)
     with progress(**OPTIONS):
         time.sleep(0.1)
-    say("nobody hears it")
+    write_line("nobody hears it")
 
 
 def talk_and_work(name: str, report: Report) -> None:
     for number in range(100):
-        say(f"{name} {number:03} " + name * 60)
+        write_line(f"{name} {number:03} " + name * 60)
         time.sleep(0.01)
         report(1)
 
@@ -170,7 +170,7 @@ def talk_and_work(name: str, report: Report) -> None:
 def test_a_pipe_gets_whole_lines_from_all_workers(workers: int, tmp_path: Path) -> None:
     script = f"""
 from test_progress import OPTIONS, module, talk_and_work
-from torchrl_bmrl.parallel import run_jobs
+from torchrl_bmrl.run.workers import run_jobs
 if __name__ == "__main__":
     module.SOON, module.INTERVAL = 0.1, 0.02
     run_jobs(talk_and_work, list("abcd"), workers={workers}, **OPTIONS)
@@ -205,7 +205,7 @@ def test_every_stage_of_a_run_says_how_far_it_is_in_a_batch_systems_log(tmp_path
 
     path = short_episodes(tmp_path / "site")
     with (tmp_path / "site" / "sitecustomize.py").open("a") as file:
-        file.write("import torchrl_bmrl.progress as module\n")
+        file.write("import torchrl_bmrl.run.progress as module\n")
         file.write("module.SOON, module.INTERVAL = 0.01, 0.02\n")
     done = recipe("two_stage", *SMALL, "run_dir=run", "workers=2", cwd=tmp_path, PYTHONPATH=path)
     assert done.returncode == 0, done.stderr

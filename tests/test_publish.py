@@ -23,12 +23,12 @@ from omegaconf import OmegaConf
 from published_data import make_rows
 from small_runs import RECIPES, command_line
 
-from torchrl_bmrl.checkpoint import save_checkpoint
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
 from torchrl_bmrl.evaluation import ResultRow, write_results
 from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports.published import read_published
+from torchrl_bmrl.training.checkpoint import save_checkpoint
 
 
 @pytest.fixture

@@ -33,9 +33,9 @@ from small_runs import (
 )
 from tensordict import TensorDict
 
-from torchrl_bmrl import progress
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.evaluation import RESULT_FIELDS, read_results
+from torchrl_bmrl.run import progress
 
 
 def show_results(folder: Path) -> dict[str, bytes]:
@@ -113,7 +113,7 @@ def test_a_one_hot_student_learns_from_the_same_agents_and_acts(
 ) -> None:
     import two_stage
 
-    from torchrl_bmrl.agents import load_student
+    from torchrl_bmrl.pipeline.agents import load_student
 
     folder = run(
         tmp_path / "run",
@@ -149,8 +149,8 @@ def test_the_policy_of_the_repository_plays_all_tasks_and_knows_its_own_demonstr
 ) -> None:
     import evaluate
 
-    from torchrl_bmrl.agents import load_student
     from torchrl_bmrl.names import TASKS
+    from torchrl_bmrl.pipeline.agents import load_student
 
     policy = RECIPES / "policies" / "sawyer.safetensors"
     assert policy.stat().st_size < 5e6
@@ -185,9 +185,9 @@ def test_an_exported_policy_acts_alone_as_it_does_in_its_run(
 ) -> None:
     import evaluate
 
-    from torchrl_bmrl.agents import load_student
     from torchrl_bmrl.data.demonstrations import read_statistics
     from torchrl_bmrl.envs.transforms import ObservationStatistics
+    from torchrl_bmrl.pipeline.agents import load_student
 
     policy = shutil.copy(exported / "policy.safetensors", tmp_path)
     kept = ObservationStatistics.from_lists(load_student(Path(policy))[1]["statistics"])
@@ -226,9 +226,9 @@ def test_the_policy_of_the_repository_is_exported_without_a_run(run: Run, tmp_pa
 def check_onnx(path: Path, policy: Path) -> None:
     """It acts as the policy does on its own demonstrations, up to actions of equal value."""
     onnxruntime = pytest.importorskip("onnxruntime")
-    from torchrl_bmrl.agents import load_student
-    from torchrl_bmrl.checkpoint import load_checkpoint
     from torchrl_bmrl.functional import sample_action_latent
+    from torchrl_bmrl.pipeline.agents import load_student
+    from torchrl_bmrl.training.checkpoint import load_checkpoint
 
     student, metadata = load_student(policy)
     acting = student.policy(num_candidates=100, latent_clip=metadata["latent_clip"])
@@ -340,7 +340,7 @@ def test_stage_1_resumed_equals_never_stopped(
 ) -> None:
     import train_bcq
 
-    from torchrl_bmrl.checkpoint import load_checkpoint
+    from torchrl_bmrl.training.checkpoint import load_checkpoint
 
     shutil.copytree(finished / "data", tmp_path / "data")
     config = OmegaConf.to_object(configured(*SMALL, f"run_dir={tmp_path}"))
@@ -411,7 +411,7 @@ def stacked(run: Run, finished: Path, tmp_path_factory: pytest.TempPathFactory) 
 @pytest.mark.robosuite
 @pytest.mark.slow
 def test_every_member_of_a_stack_has_a_checkpoint_and_curves_of_its_own(stacked: Path) -> None:
-    from torchrl_bmrl.agents import load_bcq_loss
+    from torchrl_bmrl.pipeline.agents import load_bcq_loss
 
     weights = set()
     for name, task in AGENTS.items():
@@ -433,7 +433,7 @@ def test_a_stack_resumed_equals_one_never_stopped(
 ) -> None:
     import train_bcq
 
-    from torchrl_bmrl.agents import load_bcq_loss
+    from torchrl_bmrl.pipeline.agents import load_bcq_loss
 
     shutil.copytree(finished / "data", tmp_path / "data")
     config = OmegaConf.to_object(configured(*SMALL, *STACKED, f"run_dir={tmp_path}"))
@@ -492,7 +492,7 @@ def test_a_member_that_diverges_is_named_and_frozen_and_the_others_go_on(
 ) -> None:
     import train_bcq
 
-    from torchrl_bmrl.agents import load_bcq_loss
+    from torchrl_bmrl.pipeline.agents import load_bcq_loss
 
     shutil.copytree(finished / "data", tmp_path / "data")
     calls = diverging(monkeypatch, torch.tensor([1.0, float("nan"), 1.0, 1.0]))
@@ -524,7 +524,7 @@ def test_a_single_agent_that_diverges_ends_the_run_with_its_last_checkpoint(
 ) -> None:
     import train_bcq
 
-    from torchrl_bmrl.agents import load_bcq_loss
+    from torchrl_bmrl.pipeline.agents import load_bcq_loss
 
     shutil.copytree(finished / "data", tmp_path / "data")
     diverging(monkeypatch, float("nan"))
@@ -544,7 +544,7 @@ def test_compiled_stages_train_what_eager_ones_do(
     import distill
     import train_bcq
 
-    from torchrl_bmrl.checkpoint import load_checkpoint
+    from torchrl_bmrl.training.checkpoint import load_checkpoint
 
     for kept in ("data", "bcq/reach", "logs/bcq_reach"):
         shutil.copytree(finished / kept, tmp_path / kept)
@@ -570,7 +570,7 @@ def test_without_a_gpu_captured_stages_say_so_and_train_the_same(
 ) -> None:
     import train_bcq
 
-    from torchrl_bmrl.agents import load_bcq_loss
+    from torchrl_bmrl.pipeline.agents import load_bcq_loss
 
     shutil.copytree(finished / "data", tmp_path / "data")
     run(tmp_path, train_bcq.train_all, "cudagraphs=true", "tasks=[lift]")
@@ -591,9 +591,9 @@ def trained(
     """What stage 1 trains of lift: its state, the critics' way from their start, what it logs."""
     import train_bcq
 
-    from torchrl_bmrl.agents import make_bcq_loss
-    from torchrl_bmrl.checkpoint import load_checkpoint
-    from torchrl_bmrl.parallel import derive_seed
+    from torchrl_bmrl.pipeline.agents import make_bcq_loss
+    from torchrl_bmrl.run.workers import derive_seed
+    from torchrl_bmrl.training.checkpoint import load_checkpoint
 
     shutil.copytree(finished / "data", folder / "data")
     config = OmegaConf.to_object(configured(*SMALL, f"run_dir={folder}", *overrides))
@@ -644,7 +644,7 @@ def test_stage_2_resumed_equals_never_stopped(
 ) -> None:
     import distill
 
-    from torchrl_bmrl.checkpoint import load_checkpoint
+    from torchrl_bmrl.training.checkpoint import load_checkpoint
 
     for name in ("data", "bcq"):
         shutil.copytree(finished / name, tmp_path / name)

@@ -20,10 +20,11 @@ pytest.importorskip("yaml")
 import yaml
 from wandb_files import offline, read_runs
 
-from torchrl_bmrl import __version__, runs
+from torchrl_bmrl import __version__
 from torchrl_bmrl.errors import ConfigError, DataError, UnknownNameError
 from torchrl_bmrl.files import write_atomic
-from torchrl_bmrl.runs import (
+from torchrl_bmrl.run import folder as runs
+from torchrl_bmrl.run.folder import (
     close_logger,
     log_metrics,
     make_logger,
@@ -110,7 +111,7 @@ def test_a_run_names_the_commit_of_its_sources_and_no_other_repositorys(
         return read_versions(tmp_path / "runs" / str(number)).get("commit")
 
     sources = tmp_path / "runs.py"
-    monkeypatch.setattr("torchrl_bmrl.runs.__file__", str(sources))
+    monkeypatch.setattr("torchrl_bmrl.run.folder.__file__", str(sources))
     sources.write_text("first")
     assert commit(0) is None
     git("init")

@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 import torch
 
-from torchrl_bmrl.command_line import exit_codes
 from torchrl_bmrl.errors import ConfigError, FolderInUseError, StoppedError
-from torchrl_bmrl.stops import check_stop, stop_on_signals
+from torchrl_bmrl.run.command_line import exit_codes
+from torchrl_bmrl.run.stops import check_stop, stop_on_signals
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
@@ -148,8 +148,8 @@ WRITING = """
 import sys
 from pathlib import Path
 import torch
-from torchrl_bmrl.checkpoint import save_checkpoint
-from torchrl_bmrl.command_line import exit_codes
+from torchrl_bmrl.training.checkpoint import save_checkpoint
+from torchrl_bmrl.run.command_line import exit_codes
 with exit_codes():
     for size in (10, 10**6):
         save_checkpoint(Path(sys.argv[1]), {"a": torch.zeros(size)}, {"kind": "a", "size": size})
@@ -165,7 +165,7 @@ def limit_files() -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits")
 def test_a_write_that_the_system_refuses_is_one_line_and_the_old_file_stays(tmp_path: Path) -> None:
     pytest.importorskip("safetensors")
-    from torchrl_bmrl.checkpoint import load_checkpoint
+    from torchrl_bmrl.training.checkpoint import load_checkpoint
 
     path = tmp_path / "checkpoint.safetensors"
     command = [sys.executable, "-c", WRITING, str(path)]

@@ -45,7 +45,7 @@ def run_job(
         # joblib's: workers would be told of it at their start and not know it.
         multiprocessing.set_start_method("spawn", force=True)
     # Needs an extra, and Hydra imports this module before a recipe can say which.
-    from torchrl_bmrl.progress import name_lines
+    from torchrl_bmrl.run.progress import name_lines
 
     problem = None
     try:

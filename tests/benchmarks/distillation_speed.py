@@ -20,8 +20,8 @@ import torch
 from bcq_speed import ACTION_DIM, LR, OBSERVATION_DIM, make_batch, read_options, wait, warmed_up
 from tensordict import TensorDict
 
-from torchrl_bmrl.agents import Student, make_bcq_loss, make_distillation_loss
 from torchrl_bmrl.modules import BCQPolicy
+from torchrl_bmrl.pipeline.agents import Student, make_bcq_loss, make_distillation_loss
 from torchrl_bmrl.training import accelerate, gradient_step, keep_freed_memory, make_adam
 
 TASKS, ROWS = 6, 64

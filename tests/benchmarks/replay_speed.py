@@ -26,10 +26,10 @@ import torch
 from bcq_speed import ACTION_DIM, LR, OBSERVATION_DIM, make_batch, make_library_update, make_pair
 from tensordict import TensorDict
 
-from torchrl_bmrl.agents import Student
 from torchrl_bmrl.data import make_multi_task_replay_buffer, make_replay_buffer
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.objectives import MetaDistillationLoss
+from torchrl_bmrl.pipeline.agents import Student
 
 HORIZON = 200
 WARM_UP = 5

@@ -29,7 +29,6 @@ import mujoco
 import numpy as np
 import torch
 
-from torchrl_bmrl.agents import make_bcq_loss
 from torchrl_bmrl.envs.sawyer import SawyerEnv
 from torchrl_bmrl.envs.transforms import make_env
 from torchrl_bmrl.evaluation.rollout import evaluate_policy
@@ -37,6 +36,7 @@ from torchrl_bmrl.experts.collect import collect_demonstrations
 from torchrl_bmrl.experts.controllers import make_expert
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.names import HORIZON, STEPPERS, TASKS
+from torchrl_bmrl.pipeline.agents import make_bcq_loss
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 

@@ -15,8 +15,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-import torchrl_bmrl.as_command  # noqa: F401 (first)
-from torchrl_bmrl.command_line import exit_codes
+import torchrl_bmrl.run.as_command  # noqa: F401 (first)
 from torchrl_bmrl.data.convert import TARGETS, convert
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.options import LastStep, ReadOptions, Reward
@@ -24,7 +23,8 @@ from torchrl_bmrl.data.robosuite import Relabelling
 from torchrl_bmrl.data.sources import Source, open_source
 from torchrl_bmrl.data.summary import Summary, summarise
 from torchrl_bmrl.names import TASKS
-from torchrl_bmrl.progress import progress
+from torchrl_bmrl.run.command_line import exit_codes
+from torchrl_bmrl.run.progress import progress
 
 
 def describe(source: Source, summary: Summary) -> Iterator[str]:

@@ -27,7 +27,7 @@ from torchrl_bmrl.names import (
     composition_stages,
     horizon_of,
 )
-from torchrl_bmrl.parallel import Report, derive_seed, run_jobs
+from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,9 +15,9 @@ from torchrl_bmrl.envs.rendering import render_states
 from torchrl_bmrl.errors import DataError, RenderError
 from torchrl_bmrl.extras import needs
 from torchrl_bmrl.names import TASKS
-from torchrl_bmrl.parallel import Report, run_jobs
 from torchrl_bmrl.reports.explorer import Explorer, Moment
 from torchrl_bmrl.reports.report import Embeddings
+from torchrl_bmrl.run.workers import Report, run_jobs
 
 FILMS = 2
 """Episodes of each task that have a film: more would make the page heavy."""

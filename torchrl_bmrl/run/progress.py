@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from typing import Any, Protocol
 
 from torchrl_bmrl.extras import needs
-from torchrl_bmrl.messages import say
+from torchrl_bmrl.run.logs import write_line
 
 with needs("recipes"):
     from tqdm import tqdm
@@ -110,7 +110,7 @@ class Lines:
         self.thread.join()
         if kind is None and len(self.said) > 1:
             seconds = time.monotonic() - self.started
-            say(f"{self._where()}, done in {_duration(seconds)}")
+            write_line(f"{self._where()}, done in {_duration(seconds)}")
 
     def update(self, n: float = 1) -> None:
         """Counts units that are done, or, below 0, to be done again."""
@@ -146,7 +146,7 @@ class Lines:
     def _print(self) -> None:
         pause = SOON
         while not self.ended.wait(pause):
-            say(self.line(time.monotonic()))
+            write_line(self.line(time.monotonic()))
             pause = INTERVAL
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import logging
 import math
 import os
 import platform
@@ -21,10 +22,11 @@ from torchrl_bmrl import __version__
 from torchrl_bmrl.errors import ConfigError, DataError, UnknownNameError
 from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import link_or_copy, read_json, write_atomic
-from torchrl_bmrl.messages import say
 
 with needs("recipes"):
     import yaml
+
+log = logging.getLogger(__name__)
 
 FREE_TO_CHANGE = (
     "run_dir",
@@ -275,7 +277,8 @@ def make_logger(kind: str, run_dir: Path, name: str, step: int = 0) -> Any:
             options = {"wandb_kwargs": _wandb_options(run_dir, name)} if kind == "wandb" else {}
             return get_logger(kind, str(folder), name, **options)
         except Exception as error:  # whatever a server or its library may come up with
-            say(f"{name}: no {kind} ({_first_line(error)}); metrics go to CSV files in {folder}")
+            reason = _first_line(error)
+            log.warning(f"{name}: no {kind} ({reason}); metrics go to CSV files in {folder}")
     for path in (folder / name / "scalars").glob("*.csv"):
         rows = path.read_text(encoding="utf-8").splitlines(keepends=True)
         kept = [row for row in rows if row.endswith("\n") and _step(row) <= step]
@@ -339,7 +342,7 @@ def log_metrics(logger: Any, metrics: Mapping[str, Any], step: int) -> None:
             logger.log_scalar(name, float(value), step=step)
     except Exception as error:
         _lost.add(logger)
-        say(f"metrics are logged no more, from step {step} on ({_first_line(error)})")
+        log.warning(f"metrics are logged no more, from step {step} on ({_first_line(error)})")
 
 
 def close_logger(logger: Any) -> None:
@@ -360,7 +363,7 @@ def close_logger(logger: Any) -> None:
     try:
         logger.close()
     except Exception as error:
-        say(f"the end of the metrics may be missing ({_first_line(error)})")
+        log.warning(f"the end of the metrics may be missing ({_first_line(error)})")
 
 
 _lost: WeakSet[Any] = WeakSet()

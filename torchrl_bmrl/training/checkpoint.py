@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -19,12 +20,13 @@ from torchrl_bmrl import __version__
 from torchrl_bmrl.errors import CheckpointError
 from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import link_or_copy, write_atomic
-from torchrl_bmrl.messages import say
 from torchrl_bmrl.training import get_rng_state, load_adam, set_rng_state
 
 with needs("recipes"):
     import safetensors
     import safetensors.torch
+
+log = logging.getLogger(__name__)
 
 _HEADER, _SUM = "checkpoint", "sha256"
 _TENSOR, _PAIRS = "__tensor__", "__pairs__"
@@ -165,7 +167,7 @@ def load_newest(path: Path, *, kind: str) -> tuple[State, Metadata] | None:
             continue
         _of_kind(file, metadata, kind)
         if damaged:
-            say(f"{damaged[0]}; going on from {file.name}")
+            log.warning(f"{damaged[0]}; going on from {file.name}")
             for bad in damaged:
                 os.replace(bad.path, path.with_name(f"{path.stem}.damaged{path.suffix}"))
         if file != path:

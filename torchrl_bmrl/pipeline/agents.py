@@ -13,7 +13,6 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.transforms import Transform
 
-from torchrl_bmrl.checkpoint import build, load_checkpoint
 from torchrl_bmrl.errors import CheckpointError, UnknownNameError
 from torchrl_bmrl.modules import (
     ActionVAE,
@@ -31,6 +30,7 @@ from torchrl_bmrl.modules import (
 )
 from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.objectives import BCQLoss, MetaDistillationLoss
+from torchrl_bmrl.training.checkpoint import build, load_checkpoint
 
 OBSERVATION_DIM, ACTION_DIM = 33, 7
 
@@ -85,7 +85,7 @@ def load_bcq_loss(path: Path) -> tuple[BCQLoss, dict[str, Any]]:
 
     Example:
         >>> import tempfile
-        >>> from torchrl_bmrl.checkpoint import save_checkpoint
+        >>> from torchrl_bmrl.training.checkpoint import save_checkpoint
         >>> path, options = Path(tempfile.mkdtemp()) / "a.safetensors", {"num_cells": [8]}
         >>> state = {"module": make_bcq_loss(**options).state_dict()}
         >>> save_checkpoint(path, state, {"kind": "bcq", "task": "lift", "loss": options})
@@ -284,7 +284,7 @@ def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
 
     Example:
         >>> import tempfile
-        >>> from torchrl_bmrl.checkpoint import save_checkpoint
+        >>> from torchrl_bmrl.training.checkpoint import save_checkpoint
         >>> path, options = Path(tempfile.mkdtemp()) / "a.safetensors", {"num_tasks": 1}
         >>> metadata = {"kind": "student", "student": options, "tasks": ["lift"], "accuracy": 0.99}
         >>> metadata |= {"latent_clip": 0.5, "statistics": {"loc": [0.0] * 33, "scale": [1.0] * 33}}

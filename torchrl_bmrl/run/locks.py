@@ -13,7 +13,7 @@ from typing import Any
 from torchrl_bmrl.errors import FolderInUseError
 from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import write_atomic
-from torchrl_bmrl.runs import open_run
+from torchrl_bmrl.run.folder import open_run
 
 with needs("recipes"):
     from filelock import FileLock, Timeout
@@ -64,7 +64,7 @@ def hold(folder: Path, names: Sequence[str] = ("run",)) -> Iterator[None]:
 def hold_run(
     run_dir: Path, settings: Mapping[str, Any], names: Sequence[str] = ("run",)
 ) -> Iterator[None]:
-    """Holds a run's folder (:func:`hold`) and opens it (:func:`~torchrl_bmrl.runs.open_run`).
+    """Holds a run's folder (:func:`hold`) and opens it (:func:`~torchrl_bmrl.run.folder.open_run`).
 
     Where an error comes before anything was done, what this has written is gone again: the folder
     of a run that could not start, the locks in another run's.

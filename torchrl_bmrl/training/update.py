@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import logging
 import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -14,7 +15,8 @@ from torch.optim import Adam
 from torch.optim.adam import adam
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.messages import say
+
+log = logging.getLogger(__name__)
 
 Metrics = dict[str, Tensor]
 Update = Callable[[TensorDictBase], Metrics]
@@ -285,13 +287,13 @@ def accelerate(
     """
     on_gpu = torch.device(device).type == "cuda"
     if captured and not on_gpu:
-        say(f"device={device} has no CUDA graphs; the updates run without")
+        log.warning(f"device={device} has no CUDA graphs; the updates run without")
         captured = False
     if not compiled and not captured:
         return update
     fast = update
     if compiled:
-        say("compiling the updates, which takes about half a minute")
+        log.info("compiling the updates, which takes about half a minute")
         fast = _Compiled(update, on_gpu)
     return _WithFallback(_Captured(fast) if captured else fast, update)
 
@@ -337,7 +339,9 @@ class _WithFallback:
             # A program that cannot be made has not run in part; what an eager update before a
             # capture cannot do, the plain one cannot either, and it says so itself.
             reason = str(error).strip().partition("\n")[0]
-            say(f"updates are not accelerated ({type(error).__name__}: {reason}); they run as is")
+            log.warning(
+                f"updates are not accelerated ({type(error).__name__}: {reason}); they run as is"
+            )
             self.fast, self.left = self.plain, 0
             return self.plain(batch)
 

@@ -1,6 +1,6 @@
 """Imported first by commands: an error of this library at import is one line and exit code 1.
 
-:func:`torchrl_bmrl.command_line.exit_codes` does this for what comes after the imports.
+:func:`torchrl_bmrl.run.command_line.exit_codes` does this for what comes after the imports.
 """
 
 from __future__ import annotations

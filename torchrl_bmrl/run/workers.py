@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import hashlib
+import logging
+import logging.handlers
 import multiprocessing
 import os
 import signal
@@ -20,9 +22,11 @@ from typing import Any, TypeVar
 import torch
 
 from torchrl_bmrl.errors import BMRLError, StoppedError
-from torchrl_bmrl.messages import say
-from torchrl_bmrl.progress import Progress, progress
-from torchrl_bmrl.stops import check_stop, note_signal
+from torchrl_bmrl.run.logs import LOGGER
+from torchrl_bmrl.run.progress import Progress, progress
+from torchrl_bmrl.run.stops import check_stop, note_signal
+
+log = logging.getLogger(__name__)
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -71,14 +75,14 @@ def run_jobs(
     is killed, is reported and replaced, and its job done again: a job must be one that can be, from
     the start or from what it kept. What runs here, with one worker, is not watched.
 
-    Asked to stop (:func:`~torchrl_bmrl.stops.stop_on_signals`), every job stops at its next report;
-    so do the other jobs when one fails.
+    After a signal (:func:`~torchrl_bmrl.run.stops.stop_on_signals`) every job stops at its next
+    report. The same happens to the other jobs when one fails. Workers send their log records here.
 
     Args:
         function: what to do with a job; it calls ``report(n)`` as it advances.
         jobs: its arguments.
         workers: processes; 1 runs everything here.
-        total: units over all jobs, for the time left (:func:`~torchrl_bmrl.progress.progress`).
+        total: units over all jobs, for the time left (:func:`~torchrl_bmrl.run.progress.progress`).
         description: what the jobs do.
         unit: what they count, in the singular.
 
@@ -131,7 +135,8 @@ class _Worker:
     def __init__(self, function: Callable[[Job, Report], Result]) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs, function), daemon=True)
+        level = LOGGER.getEffectiveLevel()
+        self.process = context.Process(target=_serve, args=(theirs, function, level), daemon=True)
         self.process.start()
         theirs.close()  # so that the process's end closes the pipe
         self.job = -1  # its number
@@ -158,8 +163,18 @@ class _Worker:
             self.process.kill()
 
 
-def _serve(connection: Connection, function: Callable[[Job, Report], Result]) -> None:
+class _SendRecords(logging.handlers.QueueHandler):
+    """Sends a worker's log records to the process that started it."""
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        with suppress(OSError):
+            self.queue.send(("log", record))
+
+
+def _serve(connection: Connection, function: Callable[[Job, Report], Result], level: int) -> None:
     """A worker's life: jobs in, reports and results out."""
+    LOGGER.setLevel(level)
+    LOGGER.handlers, LOGGER.propagate = [_SendRecords(connection)], False
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's
     signal.signal(signal.SIGTERM, note_signal)
@@ -220,7 +235,9 @@ def _run_in_processes(
                     kind, value = worker.connection.recv()
                 except (EOFError, OSError):
                     kind, value = "death", _death(worker)
-                if kind == "report":
+                if kind == "log":
+                    logging.getLogger(value.name).handle(value)
+                elif kind == "report":
                     worker.units += value
                     bar.update(value)
                 elif kind == "error":
@@ -236,7 +253,7 @@ def _run_in_processes(
                             f"{what}, the {TRIES}rd time; what was finished is kept, the same "
                             "command goes on"
                         )
-                    say(f"{what}; the job is done again")
+                    log.warning(f"{what}; the job is done again")
                     waiting.appendleft(number)
                 else:
                     results[number] = value

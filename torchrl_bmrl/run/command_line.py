@@ -9,8 +9,8 @@ from contextlib import contextmanager
 import torch
 
 from torchrl_bmrl.errors import BMRLError, StoppedError
-from torchrl_bmrl.messages import say
-from torchrl_bmrl.stops import stop_on_signals
+from torchrl_bmrl.run.logs import write_line
+from torchrl_bmrl.run.stops import stop_on_signals
 
 _KEPT = "what was done is kept, the same command goes on"
 _LESS = "fewer workers need less"
@@ -44,28 +44,28 @@ def exit_codes(*, out_of_memory: str = "") -> Iterator[None]:
         with stop_on_signals():
             yield
     except StoppedError as stop:
-        say(str(stop))
+        write_line(str(stop))
         raise SystemExit(128 + stop.signal) from stop
     except KeyboardInterrupt as interrupt:  # the second signal
-        say(f"interrupted; {_KEPT}")
+        write_line(f"interrupted; {_KEPT}")
         raise SystemExit(128 + signal.SIGINT) from interrupt
     except BMRLError as error:
-        say(f"error: {error}")
+        write_line(f"error: {error}")
         raise SystemExit(1) from error
     except torch.OutOfMemoryError as error:
         reason = str(error).strip().partition("\n")[0]
-        say(f"error: {'; '.join(filter(None, [reason, out_of_memory, _KEPT]))}")
+        write_line(f"error: {'; '.join(filter(None, [reason, out_of_memory, _KEPT]))}")
         raise SystemExit(1) from error
     except MemoryError as error:
-        say(f"error: out of memory; {_LESS}; {_KEPT}")
+        write_line(f"error: out of memory; {_LESS}; {_KEPT}")
         raise SystemExit(1) from error
     except RuntimeError as error:
         if "can't allocate memory" not in str(error):  # which PyTorch says of the CPU's
             raise
-        say(f"error: out of memory; {_LESS}; {_KEPT}")
+        write_line(f"error: out of memory; {_LESS}; {_KEPT}")
         raise SystemExit(1) from error
     except OSError as error:
         reason = error.strerror or str(error) or type(error).__name__
         path = f"{error.filename}: " if error.filename is not None else ""
-        say(f"error: {path}{reason}; {_KEPT}")
+        write_line(f"error: {path}{reason}; {_KEPT}")
         raise SystemExit(1) from error

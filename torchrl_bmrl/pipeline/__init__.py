@@ -1,0 +1,1 @@
+"""The two stages as functions: collect, stage 1, stage 2, evaluate, export."""
