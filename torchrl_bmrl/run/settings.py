@@ -1,0 +1,110 @@
+"""Settings as dataclasses whose fields state what is valid, and the check of both."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from torchrl_bmrl.errors import ConfigError, UnknownNameError
+
+
+def setting(
+    default: Any = dataclasses.MISSING,
+    *,
+    above: float | None = None,
+    at_least: float | None = None,
+    at_most: float | None = None,
+    choices: Sequence[Any] = (),
+    unique: bool = False,
+) -> Any:
+    """A field of a settings dataclass together with what is valid for it.
+
+    In a list or mapping the limits hold for each value. ``None`` is valid wherever the type
+    allows it.
+
+    Args:
+        default: the default; lists and dicts are copied for each object.
+        above: values must be larger.
+        at_least: values must not be smaller.
+        at_most: values must not be larger.
+        choices: the valid values.
+        unique: a list must not be empty and must hold each value once.
+
+    Example:
+        >>> @dataclasses.dataclass
+        ... class Small:
+        ...     lr: float = setting(1e-3, above=0)
+        >>> check_settings(Small(lr=-1.0))
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.ConfigError: lr is -1.0; valid: above 0
+    """
+    valid = {
+        "above": above,
+        "at_least": at_least,
+        "at_most": at_most,
+        "choices": tuple(choices),
+        "unique": unique,
+    }
+    if isinstance(default, list | dict):
+        return dataclasses.field(default_factory=default.copy, metadata=valid)
+    return dataclasses.field(default=default, metadata=valid)
+
+
+def check_settings(settings: Any, prefix: str = "") -> None:
+    """Compares every field of a settings dataclass, and of those in it, with what is valid.
+
+    Args:
+        settings: the object.
+        prefix: of the names in messages, such as ``"bcq."``.
+
+    Raises:
+        UnknownNameError: for a value that is none of the choices.
+        ConfigError: naming the field, its value and what is valid.
+    """
+    for field in dataclasses.fields(settings):
+        name, value = f"{prefix}{field.name}", getattr(settings, field.name)
+        if dataclasses.is_dataclass(value):
+            check_settings(value, f"{name}.")
+        elif field.metadata:
+            _check(name, value, field.metadata)
+
+
+def _check(name: str, value: Any, valid: Mapping[str, Any]) -> None:
+    if valid["unique"] and (not value or len(set(value)) < len(value)):
+        raise ConfigError(f"{name} is {value}; valid: at least one value, each once")
+    for key, item in _items(name, value):
+        if valid["choices"] and item not in valid["choices"]:
+            raise UnknownNameError(name, item, valid["choices"])
+        if isinstance(item, int | float) and not _is_within(item, valid):
+            raise ConfigError(f"{key} is {item}; valid: {_describe(valid)}")
+
+
+def _items(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """The values of a setting, each with its name."""
+    if isinstance(value, Mapping):
+        yield from ((f"{name}.{key}", item) for key, item in value.items())
+    elif isinstance(value, list | tuple):
+        yield from ((name, item) for item in value)
+    else:
+        yield name, value
+
+
+def _is_within(number: float, valid: Mapping[str, Any]) -> bool:
+    above, low, high = valid["above"], valid["at_least"], valid["at_most"]
+    if above is low is high is None:
+        return True
+    return (
+        math.isfinite(number)
+        and (above is None or number > above)
+        and (low is None or number >= low)
+        and (high is None or number <= high)
+    )
+
+
+def _describe(valid: Mapping[str, Any]) -> str:
+    words = {"above": "above", "at_least": "at least", "at_most": "at most"}
+    limits = [f"{text} {valid[key]:g}" for key, text in words.items() if valid[key] is not None]
+    return " and ".join(limits)
