@@ -59,9 +59,10 @@ class Task:
         record: ``record(seed, noise=..., gains=..., after=..., **options)`` returns an
             :class:`~torchrl_bmrl.data.Episode` of a scripted expert.
         files: demonstrations that were recorded elsewhere, and how to read them.
-        observation: returns the transforms that make ``observation`` of the named parts, for
-            stored data and environments alike; ``None``: the parts are concatenated in the order
-            of the data.
+        parts: names of the observation's parts in demonstrations and environment; ``None``: all
+            parts of the demonstrations.
+        observation: returns the transforms that make ``observation`` of the parts, for stored data
+            and environments alike; ``None``: the parts are concatenated.
         options: keyword arguments of ``make_env`` and ``record``. Settings may override them.
         horizon: steps after which an episode is truncated; ``None``: the longest demonstration.
         success: key of the environment's ``info`` that tells success; ``None``: the task has no
@@ -82,6 +83,7 @@ class Task:
     make_env: Callable[..., EnvBase] | None = None
     record: Callable[..., Episode] | None = None
     files: DemonstrationFiles | None = None
+    parts: tuple[str, ...] | None = None
     observation: Callable[[], list[Transform]] | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     horizon: int | None = None
@@ -181,5 +183,7 @@ def get_task(name: str) -> Task:
     composers = {task.compose for task in tasks}
     compose = tasks[0].compose
     if len(composers) > 1 or compose is None:
-        raise ConfigError(f"task {name}: {', '.join(parts)} cannot follow each other in one episode")
+        raise ConfigError(
+            f"task {name}: {', '.join(parts)} cannot follow each other in one episode"
+        )
     return compose(tasks)

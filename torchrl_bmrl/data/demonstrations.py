@@ -1,9 +1,9 @@
-"""From the demonstrations of a run folder to what trains: checked, normalised transitions."""
+"""Demonstrations of a run folder as training data: checked, normalised transitions."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,64 +13,74 @@ from torch import Tensor
 
 from torchrl_bmrl.data.datasets import RobomimicExperienceReplay
 from torchrl_bmrl.data.robomimic import open_episodes
-from torchrl_bmrl.data.schema import ACTION_DIM, OBSERVATION_SHAPES
-from torchrl_bmrl.envs.transforms import ObservationStatistics, transform_data
+from torchrl_bmrl.envs.transforms import (
+    ObservationStatistics,
+    make_observation_transform,
+    observation_parts,
+    transform_data,
+)
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.files import read_json, write_atomic
-from torchrl_bmrl.names import TASKS, check_task
+from torchrl_bmrl.tasks import Task
 
 
-def demonstration_path(data_dir: Path, task: str) -> Path:
-    """The file of a task's demonstrations."""
-    return data_dir / f"{check_task(task)}.hdf5"
+def demonstration_path(data_dir: Path, task: Task) -> Path:
+    """The file with a task's demonstrations."""
+    return data_dir / f"{task.name}.hdf5"
 
 
-def read_demonstrations(path: Path, *, split: str | None = None, num_task: int) -> TensorDictBase:
-    """Demonstrations of one of the six tasks as they were recorded.
+def read_demonstrations(
+    path: Path, task: Task, *, split: str | None = None, index: int
+) -> TensorDictBase:
+    """Demonstrations of a task as they were recorded.
 
     Args:
-        path: a file in robomimic's layout; converted once, beside it.
+        path: a file in robomimic's layout; it is converted once, beside the file.
+        task: the task.
         split: ``"train"``, ``"valid"`` or ``None`` for all.
-        num_task: class index y.
+        index: class index y of the task.
 
     Returns:
         batch ``[N]`` with the keys of
         :class:`~torchrl_bmrl.data.datasets.RobomimicExperienceReplay` and ``task``.
 
     Raises:
-        DataError: naming file and key, for what that class refuses, and for parts of the
-            observation or actions that are not the six tasks', missing ``successes``, or an episode
-            that terminates: these tasks end at their horizon, which truncates.
+        DataError: naming file and key: for a file that this class refuses, for parts that do not
+            make an observation, for missing ``successes`` if the task has a definition of success,
+            and for a recorded task whose episode terminates, since its horizon only truncates.
 
     Example:
         >>> import tempfile
         >>> from torchrl_bmrl.data import Episode
         >>> from torchrl_bmrl.data.robomimic import write_episodes
-        >>> parts = {name: np.zeros((5, size)) for name, size in OBSERVATION_SHAPES.items()}
+        >>> from torchrl_bmrl.tasks import DemonstrationFiles
+        >>> parts = {"arm": np.zeros((5, 7)), "door": np.zeros((5, 1))}
         >>> episode = Episode(
         ...     observations=parts,
         ...     next_observations=parts,
         ...     actions=np.zeros((5, 7)),
         ...     rewards=np.zeros(5),
         ...     terminated=np.zeros(5, bool),
-        ...     extras={"successes": np.zeros(5, bool)},
         ... )
-        >>> folder = Path(tempfile.mkdtemp())
-        >>> write_episodes(folder / "lift.hdf5", [episode], env_args={}, masks={"train": [0]})
-        >>> data = read_demonstrations(folder / "lift.hdf5", split="train", num_task=1)
-        >>> data["robot0_eef_pos"].shape, data["task"].tolist()
-        (torch.Size([5, 3]), [1, 1, 1, 1, 1])
+        >>> path = Path(tempfile.mkdtemp()) / "door.hdf5"
+        >>> write_episodes(path, [episode], env_args={}, masks={"train": [0]})
+        >>> task = Task(name="door", files=DemonstrationFiles(path=str(path)))
+        >>> read_demonstrations(path, task, split="train", index=1)["task"].tolist()
+        [1, 1, 1, 1, 1]
     """
-    replay = RobomimicExperienceReplay(path, split=split, observation_keys=OBSERVATION_SHAPES)
-    data = replay[:].copy()
-    for key, size in {**OBSERVATION_SHAPES, "action": ACTION_DIM}.items():
-        if data[key].shape[1:] != (size,):
-            raise DataError(path, key, f"shape {tuple(data[key].shape)}; valid: (N, {size})")
-    if data.get(("next", "success"), None) is None:
+    data = RobomimicExperienceReplay(path, split=split, observation_keys=task.parts)[:].copy()
+    try:
+        transform = make_observation_transform(task, parts=observation_parts(task, data))
+        transform(data[:1].exclude("next"))
+    except (KeyError, RuntimeError, TypeError) as error:
+        raise DataError(
+            path, "obs", f"does not make an observation of task {task.name} ({error})"
+        ) from error
+    if task.success is not None and data.get(("next", "success"), None) is None:
         raise DataError(path, "data", "no successes; valid: successes (T,) in every demonstration")
-    if data["next", "terminated"].any():
+    if task.record is not None and data["next", "terminated"].any():
         raise DataError(path, "terminated", "an episode terminates; valid: none, horizons truncate")
-    return data.set("task", torch.full((len(data),), num_task))
+    return data.set("task", torch.full((len(data),), index))
 
 
 def read_phases(path: Path, *, split: str) -> tuple[Tensor, tuple[str, ...]]:
@@ -111,135 +121,107 @@ def read_phases(path: Path, *, split: str) -> tuple[Tensor, tuple[str, ...]]:
     return (joined, names) if names else (torch.zeros_like(joined), ())
 
 
-def write_statistics(data_dir: Path, tasks: Iterable[str]) -> ObservationStatistics:
-    """Statistics of the training demonstrations, kept in ``statistics.json``.
+def write_statistics(data_dir: Path, tasks: Sequence[Task]) -> ObservationStatistics:
+    """Computes the statistics of the training demonstrations and writes ``statistics.json``.
 
-    Those over all tasks together (``loc`` and ``scale``) normalise; those of each task are under
-    ``tasks``.
+    ``loc`` and ``scale`` over all tasks together normalise observations; those of each task are
+    stored under ``tasks``.
 
     Args:
-        data_dir: folder of the demonstrations, ``<task>.hdf5``, each with a mask ``train``; the
-            statistics are written into it.
-        tasks: names of the tasks, each with the same weight.
+        data_dir: folder with ``<task>.hdf5``, each with a mask ``train``.
+        tasks: the tasks, which have the same weight.
 
     Returns:
-        those over all tasks together.
+        the statistics over all tasks together.
 
     Raises:
-        UnknownNameError: for a name that is not a task.
-        DataError: for files that :func:`read_demonstrations` refuses.
-
-    Example:
-        >>> import tempfile
-        >>> from torchrl_bmrl.data import Episode
-        >>> from torchrl_bmrl.data.robomimic import write_episodes
-        >>> parts = {name: np.zeros((5, size)) for name, size in OBSERVATION_SHAPES.items()}
-        >>> episode = Episode(
-        ...     observations=parts,
-        ...     next_observations=parts,
-        ...     actions=np.zeros((5, 7)),
-        ...     rewards=np.zeros(5),
-        ...     terminated=np.zeros(5, bool),
-        ...     extras={"successes": np.zeros(5, bool)},
-        ... )
-        >>> folder = Path(tempfile.mkdtemp())
-        >>> write_episodes(folder / "lift.hdf5", [episode], env_args={}, masks={"train": [0]})
-        >>> write_statistics(folder, ["lift"]).loc.shape
-        torch.Size([33])
+        DataError: for files that :func:`read_demonstrations` refuses, and for tasks whose
+            observations or actions differ in size or parts.
     """
-    raw = {
-        task: read_demonstrations(
-            demonstration_path(data_dir, task), split="train", num_task=TASKS.index(task)
-        )
-        for task in tasks
+    raw = [
+        read_demonstrations(demonstration_path(data_dir, task), task, split="train", index=index)
+        for index, task in enumerate(tasks)
+    ]
+    first = _layout(tasks[0], raw[0])
+    for task, data in zip(tasks, raw, strict=True):
+        if (layout := _layout(task, data)) != first:
+            raise DataError(
+                demonstration_path(data_dir, task),
+                None,
+                f"its transitions have {layout}; valid: {first}, as those of {tasks[0].name}",
+            )
+    statistics = ObservationStatistics.of(raw, tasks)
+    each = {
+        task.name: ObservationStatistics.of([data], [task]).to_lists() | {"transitions": len(data)}
+        for task, data in zip(tasks, raw, strict=True)
     }
-    statistics = ObservationStatistics.of(list(raw.values()))
-    content = _plain(statistics) | {
-        "tasks": {
-            task: _plain(ObservationStatistics.of([data])) | {"transitions": len(data)}
-            for task, data in raw.items()
-        }
-    }
-    write_atomic(data_dir / "statistics.json", json.dumps(content) + "\n")
+    write_atomic(
+        data_dir / "statistics.json", json.dumps(statistics.to_lists() | {"tasks": each}) + "\n"
+    )
     return statistics
 
 
-def _plain(statistics: ObservationStatistics) -> dict[str, object]:
-    return {"loc": statistics.loc.tolist(), "scale": statistics.scale.tolist()}
+def _layout(task: Task, data: TensorDictBase) -> str:
+    """Sizes of the observation's parts and of the action, for messages."""
+    names = task.parts or observation_parts(task, data) or ()
+    sizes = [f"{name} {tuple(data[name].shape[1:])}" for name in (*names, "action")]
+    return ", ".join(sizes)
 
 
-def read_statistics(data_dir: Path, task: str | None = None) -> ObservationStatistics:
-    """Reads what :func:`write_statistics` wrote.
+def read_statistics(data_dir: Path, task: Task | None = None) -> ObservationStatistics:
+    """Reads the statistics that :func:`write_statistics` wrote.
 
     Args:
         data_dir: folder of the demonstrations.
         task: whose statistics; ``None`` for those over all tasks.
 
     Raises:
-        DataError: if the file is missing or damaged, or knows nothing of the task.
+        DataError: if the file is missing or damaged, or does not contain the task.
 
     Example:
         >>> import tempfile
         >>> folder = Path(tempfile.mkdtemp())
         >>> write_atomic(folder / "statistics.json", '{"loc": [0.5], "scale": [2.0]}')
-        >>> read_statistics(folder)
-        ObservationStatistics(loc=tensor([0.5000]), scale=tensor([2.]))
+        >>> read_statistics(folder).scale
+        tensor([2.])
     """
     path = data_dir / "statistics.json"
     if not path.is_file():
         raise DataError(path, None, "no such file; recipes/collect.py writes it")
     content = read_json(path, "the statistics of a data set")
+    name = None if task is None else task.name
     try:
-        if task is not None:
-            content = content["tasks"][task]
-        loc, scale = (torch.tensor(content[name], dtype=torch.float) for name in ("loc", "scale"))
-    except (ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise DataError(path, task, f"not the statistics of a data set ({error})") from error
+        content = content if name is None else content["tasks"][name]
+        statistics = ObservationStatistics.from_lists(content)
+    except (AttributeError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise DataError(path, name, f"not the statistics of a data set ({error})") from error
+    loc, scale = statistics.loc, statistics.scale
     finite = torch.cat([loc.reshape(-1), scale.reshape(-1)]).isfinite().all()
     if loc.shape != scale.shape or loc.ndim != 1 or not finite or not (scale > 0).all():
         raise DataError(path, "scale", "valid: as many positive numbers as in loc, all finite")
-    return ObservationStatistics(loc, scale)
+    return statistics
 
 
 def load_transitions(
-    data_dir: Path, task: str, statistics: ObservationStatistics, *, split: str, num_task: int
+    data_dir: Path, task: Task, statistics: ObservationStatistics, *, split: str, index: int
 ) -> TensorDictBase:
     """A task's transitions, normalised.
 
     Args:
         data_dir: folder of the demonstrations.
-        task: its name.
+        task: the task.
         statistics: of the normalisation.
         split: ``"train"`` or ``"valid"``.
-        num_task: class index y.
+        index: class index y of the task.
 
     Returns:
-        batch ``[N]`` with ``observation (N, 33)`` in place of its parts, now and under ``"next"``,
+        batch ``[N]`` with ``observation (N, n)`` in place of its parts, now and under ``"next"``,
         and the other keys of :func:`read_demonstrations`.
 
     Raises:
-        UnknownNameError: for a name that is not a task.
         DataError: for a file that :func:`read_demonstrations` refuses.
-
-    Example:
-        >>> import tempfile
-        >>> from torchrl_bmrl.data import Episode
-        >>> from torchrl_bmrl.data.robomimic import write_episodes
-        >>> parts = {name: np.zeros((5, size)) for name, size in OBSERVATION_SHAPES.items()}
-        >>> episode = Episode(
-        ...     observations=parts,
-        ...     next_observations=parts,
-        ...     actions=np.zeros((5, 7)),
-        ...     rewards=np.zeros(5),
-        ...     terminated=np.zeros(5, bool),
-        ...     extras={"successes": np.zeros(5, bool)},
-        ... )
-        >>> folder = Path(tempfile.mkdtemp())
-        >>> write_episodes(folder / "lift.hdf5", [episode], env_args={}, masks={"train": [0]})
-        >>> statistics = ObservationStatistics(torch.zeros(33), torch.ones(33))
-        >>> data = load_transitions(folder, "lift", statistics, split="train", num_task=1)
-        >>> data["next", "observation"].shape
-        torch.Size([5, 33])
     """
-    raw = read_demonstrations(demonstration_path(data_dir, task), split=split, num_task=num_task)
-    return transform_data(raw, statistics)
+    path = demonstration_path(data_dir, task)
+    return transform_data(
+        read_demonstrations(path, task, split=split, index=index), task, statistics
+    )

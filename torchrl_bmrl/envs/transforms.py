@@ -11,8 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import GymEnv, GymWrapper, TransformedEnv
-from torchrl.envs.gym_like import default_info_dict_reader
+from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import (
     CatTensors,
     Compose,
@@ -22,21 +21,9 @@ from torchrl.envs.transforms import (
     Transform,
 )
 
-from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.extras import needs
+from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.functional import nonzero_scale
-from torchrl_bmrl.names import composition_stages, gymnasium_id, horizon_of
-
-OBSERVATION_PARTS = (
-    "sin_joint_pos",
-    "cos_joint_pos",
-    "robot0_gripper_qpos",
-    "robot0_joint_vel",
-    "robot0_eef_pos",
-    "robot0_eef_quat",
-    "goal_pos",
-)
-"""Order of the parts in ``observation (33,)``: 7 + 7 + 2 + 7 + 3 + 4 + 3."""
+from torchrl_bmrl.tasks import Task, get_task
 
 
 class SinCosTransform(Transform):
@@ -222,11 +209,13 @@ class StageReward(Transform):
 
 @dataclass(frozen=True)
 class ObservationStatistics:
-    """Mean and scale of ``observation``, ``(33,)`` each, over the training demonstrations.
+    """Mean and scale of ``observation (n,)`` over the training demonstrations.
 
     Attributes:
         loc: mean.
         scale: standard deviation, at least 1e-3; 1 where the observation is constant.
+        parts: names of the parts that are concatenated to the observation; ``None`` for a task
+            with transforms of its own.
 
     Example:
         >>> ObservationStatistics(loc=torch.zeros(33), scale=torch.ones(33)).scale.shape
@@ -235,56 +224,88 @@ class ObservationStatistics:
 
     loc: Tensor
     scale: Tensor
+    parts: tuple[str, ...] | None = None
 
     @classmethod
-    def from_lists(cls, lists: Mapping[str, Sequence[float]]) -> ObservationStatistics:
-        """Statistics as a checkpoint's metadata keep them.
+    def from_lists(cls, lists: Mapping[str, Any]) -> ObservationStatistics:
+        """Statistics from the lists of :meth:`to_lists`.
 
         Args:
-            lists: ``loc`` and ``scale``, as many numbers in each.
+            lists: ``loc`` and ``scale`` with the same length and, optionally, ``parts``.
 
         Example:
-            >>> ObservationStatistics.from_lists({"loc": [1.0], "scale": [2.0]})
-            ObservationStatistics(loc=tensor([1.]), scale=tensor([2.]))
+            >>> ObservationStatistics.from_lists({"loc": [1.0], "scale": [2.0]}).scale
+            tensor([2.])
         """
-        return cls(torch.tensor(lists["loc"]), torch.tensor(lists["scale"]))
+        parts = lists.get("parts")
+        loc, scale = (torch.tensor(lists[name], dtype=torch.float) for name in ("loc", "scale"))
+        return cls(loc, scale, None if parts is None else tuple(parts))
+
+    def to_lists(self) -> dict[str, Any]:
+        """The statistics as JSON-compatible lists."""
+        lists = {"loc": self.loc.tolist(), "scale": self.scale.tolist()}
+        return lists if self.parts is None else lists | {"parts": list(self.parts)}
 
     @classmethod
-    def of(cls, datasets: Sequence[TensorDictBase]) -> ObservationStatistics:
-        """Statistics over all tasks together, each task with the same weight.
+    def of(cls, datasets: Sequence[TensorDictBase], tasks: Sequence[Task]) -> ObservationStatistics:
+        """Statistics over all tasks together; every task has the same weight.
 
         Args:
             datasets: one batch ``[N_i]`` per task, with the named parts.
+            tasks: the tasks.
         """
-        raw = make_observation_transform()
-        observations = [raw(data.copy()).get("observation").double() for data in datasets]
+        parts = observation_parts(tasks[0], datasets[0])
+        observations = [
+            make_observation_transform(task, parts=parts)(data.copy()).get("observation").double()
+            for task, data in zip(tasks, datasets, strict=True)
+        ]
         loc = torch.stack([x.mean(0) for x in observations]).mean(0)
         second = torch.stack([(x - loc).square().mean(0) for x in observations]).mean(0)
         largest = torch.stack([x.abs().amax(0) for x in observations]).amax(0)
         scale = nonzero_scale(second.sqrt(), largest, torch.float32)  # as they were before double()
-        return cls(loc.float(), scale.clamp_min(1e-3).float())
+        return cls(loc.float(), scale.clamp_min(1e-3).float(), parts)
 
 
-def make_observation_transform(statistics: ObservationStatistics | None = None) -> Compose:
-    """Transform from the named parts to ``observation (33,)`` float32, normalised if asked to.
+def observation_parts(task: Task, data: TensorDictBase) -> tuple[str, ...] | None:
+    """Names of the parts that are concatenated; ``None`` for a task with its own transforms."""
+    if task.observation is not None:
+        return None
+    following = data.get("next").keys()
+    return task.parts or tuple(key for key in data.keys() if key in following)  # noqa: SIM118
 
-    It serves an environment (append it) and stored data (call it) alike.
+
+def make_observation_transform(
+    task: Task,
+    statistics: ObservationStatistics | None = None,
+    *,
+    parts: Sequence[str] | None = None,
+) -> Compose:
+    """Transform from the named parts to ``observation (n,)`` float32, normalised if asked to.
+
+    It serves environments (append it) and stored data (call it) alike.
 
     Args:
+        task: whose observation.
         statistics: of the normalisation; ``None`` leaves the observation as it is.
+        parts: names to concatenate, for a task without transforms of its own; by default those of
+            the statistics or of the task.
 
     Example:
         >>> from tensordict import TensorDict
-        >>> from torchrl_bmrl.data.schema import OBSERVATION_SHAPES
-        >>> parts = {name: torch.zeros(4, size) for name, size in OBSERVATION_SHAPES.items()}
-        >>> make_observation_transform()(TensorDict(parts, [4]))["observation"].shape
-        torch.Size([4, 33])
+        >>> from torchrl_bmrl.tasks import DemonstrationFiles, Task
+        >>> task = Task(name="door", files=DemonstrationFiles(path="door.hdf5"))
+        >>> transform = make_observation_transform(task, parts=["arm", "door"])
+        >>> parts = {"arm": torch.zeros(4, 7), "door": torch.zeros(4, 1)}
+        >>> transform(TensorDict(parts, [4]))["observation"].shape
+        torch.Size([4, 8])
     """
-    transforms: list[Transform] = [
-        SinCosTransform("robot0_joint_pos", "sin_joint_pos", "cos_joint_pos"),
-        CatTensors(list(OBSERVATION_PARTS), "observation", dim=-1, sort=False, del_keys=True),
-        DoubleToFloat(in_keys=["observation"]),
-    ]
+    names = parts or (statistics and statistics.parts) or task.parts or ("observation",)
+    transforms: list[Transform] = (
+        [CatTensors(list(names), "observation", dim=-1, sort=False, del_keys=True)]
+        if task.observation is None
+        else task.observation()
+    )
+    transforms.append(DoubleToFloat(in_keys=["observation"]))
     if statistics is not None:
         transforms.append(
             ObservationNorm(
@@ -297,54 +318,45 @@ def make_observation_transform(statistics: ObservationStatistics | None = None) 
     return Compose(*transforms)
 
 
-def transform_data(data: TensorDictBase, statistics: ObservationStatistics) -> TensorDictBase:
+def transform_data(
+    data: TensorDictBase, task: Task, statistics: ObservationStatistics
+) -> TensorDictBase:
     """Applies :func:`make_observation_transform` to stored transitions, now and next.
 
     Args:
-        data: batch ``[N]`` with the named parts, as
-            :func:`torchrl_bmrl.data.stack_episodes` returns it.
+        data: batch ``[N]`` with the named parts.
+        task: whose observation.
         statistics: of the normalisation.
 
     Returns:
-        batch ``[N]`` with ``observation (N, 33)`` in place of the parts, now and under ``"next"``,
-        and what else there was.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> from torchrl_bmrl.data.schema import OBSERVATION_SHAPES
-        >>> parts = {name: torch.zeros(4, size) for name, size in OBSERVATION_SHAPES.items()}
-        >>> statistics = ObservationStatistics(torch.zeros(33), torch.ones(33))
-        >>> data = transform_data(TensorDict({**parts, "next": parts}, [4]), statistics)
-        >>> data["next", "observation"].shape
-        torch.Size([4, 33])
+        batch ``[N]`` with ``observation (N, n)`` in place of the parts, now and under ``"next"``,
+        and the other keys of ``data``.
     """
-    transform = make_observation_transform(statistics)
+    transform = make_observation_transform(task, statistics)
     after = transform(data.get("next").copy())
     return transform(data.exclude("next")).set("next", after)
 
 
 def make_env(
-    task: str,
+    task: Task | str,
     statistics: ObservationStatistics | None = None,
     *transforms: Transform,
     num_envs: int | None = None,
-    **kwargs: Any,
+    **options: Any,
 ) -> TransformedEnv:
-    """One task as a TorchRL environment with ``observation (33,)``.
-
-    ``success``, ``stage`` and each reward term, ``reward_<term>``, are read from ``info`` into the
-    tensordict.
+    """A task as a TorchRL environment with ``observation (n,)``.
 
     Args:
-        task: one of the six, or a composition: several joined by ``-``.
+        task: a task, or the name of a registered one or of a composition.
         statistics: of the normalisation.
         *transforms: appended, such as a source of ``task_latent``.
-        num_envs: batch size ``[num_envs]``: episodes in one simulator, for a policy that acts in
-            all of them with one call; ``None`` for no batch dimension.
-        **kwargs: of the gymnasium environment, such as ``render_mode`` or ``stepper``.
+        num_envs: number of episodes side by side, batch ``[num_envs]``; ``None`` for one without
+            a batch dimension.
+        **options: of the task's environment, in place of the task's own.
 
     Raises:
-        UnknownNameError: for a name that is not a task.
+        UnknownNameError: for a name that is not registered.
+        ConfigError: for a task without an environment.
         BMRLError: for ``num_envs`` below one.
 
     Example:
@@ -352,29 +364,11 @@ def make_env(
         >>> env.rollout(3)["next", "observation"].shape
         torch.Size([2, 3, 33])
     """
-    # Imported here: the reading of data does not need the simulator.
-    with needs("robosuite"):
-        import gymnasium
-
-    from torchrl_bmrl.envs.tasks import REWARD_TERMS
-
-    name = f"torchrl_bmrl.envs:{gymnasium_id(task)}"
-    if len(composition_stages(task)) > 1:  # these share one id
-        kwargs = {"task": task, "horizon": horizon_of(task)} | kwargs
-    env = (
-        GymEnv(name, **kwargs)
-        if num_envs is None
-        else GymWrapper(gymnasium.make_vec(name, num_envs, **kwargs))
-    )
-    shape = env.batch_size
-    keys = ["success", "stage", *(f"reward_{name}" for name in REWARD_TERMS)]
-    spec = Composite(
-        success=Unbounded(shape, dtype=torch.bool),
-        stage=Unbounded(shape, dtype=torch.int64),
-        **{key: Unbounded(shape, dtype=torch.float64) for key in keys[2:]},
-        shape=shape,
-    )
-    env.set_info_dict_reader(default_info_dict_reader(keys, spec=spec))
-    return TransformedEnv(
-        env, Compose(make_observation_transform(statistics), RewardSum(), *transforms)
-    )
+    task = get_task(task) if isinstance(task, str) else task
+    if task.make_env is None:
+        raise ConfigError(f"task {task.name} has no environment; valid: a task with make_env")
+    if num_envs is not None and num_envs < 1:
+        raise BMRLError(f"num_envs is {num_envs}; valid: at least 1")
+    env = task.make_env(num_envs=num_envs, **{**task.options, **options})
+    observation = make_observation_transform(task, statistics)
+    return TransformedEnv(env, Compose(observation, RewardSum(), *transforms))

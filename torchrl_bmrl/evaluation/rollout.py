@@ -9,19 +9,20 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
+from torchrl.envs.batched_envs import BatchedEnvBase
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.names import HORIZON
 
 
 @dataclass(frozen=True)
 class EpisodeOutcome:
-    """What an episode came to.
+    """Return and success of one episode.
 
     Attributes:
-        episode_return: sum of rewards over the horizon.
-        success: whether the task's definition held at some step (robomimic's convention).
-        stages: tasks of a composition that were done.
+        episode_return: sum of rewards up to the end of the episode.
+        success: whether the task succeeded at some step (robomimic's convention); ``None`` if the
+            task has no definition of success.
+        stages: number of a composition's tasks that succeeded.
 
     Example:
         >>> EpisodeOutcome(episode_return=151.2, success=True)
@@ -29,7 +30,7 @@ class EpisodeOutcome:
     """
 
     episode_return: float
-    success: bool
+    success: bool | None
     stages: int = 0
 
 
@@ -38,7 +39,7 @@ def rollout_episodes(
     policy: TensorDictModuleBase,
     *,
     seed: int | Sequence[int],
-    max_steps: int = HORIZON,
+    max_steps: int,
     report: Callable[[int], object] | None = None,
 ) -> TensorDictBase:
     """One episode, or one in each environment of a batch; the policy acts in all with one call.
@@ -51,7 +52,7 @@ def rollout_episodes(
         policy: writes ``action``.
         seed: of the episode; of each one, N of them, in a batch. The policy draws for all of them
             from one stream, so that its draws depend on the others.
-        max_steps: length.
+        max_steps: steps after which the episodes are cut off.
         report: called after every step with the number of episodes that advanced.
 
     Returns:
@@ -81,8 +82,16 @@ def rollout_episodes(
 
     with torch.random.fork_rng(devices=[]), torch.no_grad():
         torch.manual_seed(seeds[0])
-        start = env.reset(seed=seeds if env.batch_size else seeds[0])
-        data = env.rollout(max_steps, policy, tensordict=start, auto_reset=False, callback=callback)
+        options: dict[str, bool] = {}
+        if isinstance(getattr(env, "base_env", env), BatchedEnvBase):
+            start = env.reset(list_of_kwargs=[{"seed": each} for each in seeds])
+            # Episodes end one by one; the last observation of an ended one is repeated.
+            options = {"break_when_any_done": False, "break_when_all_done": True}
+        else:
+            start = env.reset(seed=seeds if env.batch_size else seeds[0])
+        data = env.rollout(
+            max_steps, policy, tensordict=start, auto_reset=False, callback=callback, **options
+        )
     if report is not None:
         report(data.numel() - reported)  # TorchRL calls back between steps: not after the last
     return data
@@ -93,7 +102,7 @@ def evaluate_policy(
     policy: TensorDictModuleBase,
     seeds: Sequence[int],
     *,
-    max_steps: int = HORIZON,
+    max_steps: int,
     report: Callable[[int], object] | None = None,
 ) -> list[EpisodeOutcome]:
     """Outcome of one episode per seed, in their order.
@@ -101,10 +110,10 @@ def evaluate_policy(
     An environment of batch size ``[N]`` plays N of them at a time.
 
     Args:
-        env: environment with ``observation`` and ``success``, batch ``[]`` or ``[N]``.
+        env: environment with ``observation`` and perhaps ``success``, batch ``[]`` or ``[N]``.
         policy: writes ``action``.
         seeds: of the episodes; a multiple of N.
-        max_steps: length of an episode.
+        max_steps: steps after which an episode is cut off.
         report: called after every step with the number of episodes that advanced.
 
     Raises:
@@ -121,12 +130,15 @@ def evaluate_policy(
     outcomes, size = [], env.numel()
     for first in range(0, len(seeds), size):
         part = seeds[first : first + size]
-        after = rollout_episodes(env, policy, seed=part, max_steps=max_steps, report=report).get(
-            "next"
-        )
-        returns = after.get("reward").double().sum((-2, -1)).reshape(-1)
-        successes = after.get("success").any(-1).reshape(-1)
-        stages = after.get("stage", torch.zeros_like(successes)).reshape(len(part), -1).amax(-1)
-        rows = zip(returns.tolist(), successes.tolist(), stages.tolist(), strict=True)
+        data = rollout_episodes(env, policy, seed=part, max_steps=max_steps, report=report)
+        after = data.get("next").reshape(len(part), -1)
+        done = after.get("done").squeeze(-1).long()
+        playing = done.cumsum(-1) - done == 0  # up to the step that ends the episode
+        returns = (after.get("reward").double().squeeze(-1) * playing).sum(-1).tolist()
+        successes: list[bool | None] = [None] * len(part)
+        if (success := after.get("success", None)) is not None:
+            successes = (success.reshape(len(part), -1) & playing).any(-1).tolist()
+        stages = after.get("stage", torch.zeros_like(done)).reshape(len(part), -1).amax(-1)
+        rows = zip(returns, successes, stages.tolist(), strict=True)
         outcomes += [EpisodeOutcome(*row) for row in rows]
     return outcomes

@@ -28,37 +28,37 @@ from torchrl_bmrl.modules import (
     make_task_encoder,
     prototype,
 )
-from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.objectives import BCQLoss, MetaDistillationLoss
 from torchrl_bmrl.training.checkpoint import build, load_checkpoint
 
-OBSERVATION_DIM, ACTION_DIM = 33, 7
+_SIX_TASKS = {"observation_dim": 33, "action_dim": 7}
+"""Sizes in checkpoints that were written when there were only the six Sawyer tasks."""
 
 
 def make_bcq_loss(
     *,
+    observation_dim: int,
+    action_dim: int,
     num_cells: Sequence[int] = (256, 256),
     num_qvalue_nets: int = 2,
     perturbation: bool = False,
-    observation_dim: int = OBSERVATION_DIM,
-    action_dim: int = ACTION_DIM,
     **options: Any,
 ) -> BCQLoss:
     """A :class:`BCQLoss` over freshly initialised networks.
 
     Args:
+        observation_dim: size of the observation.
+        action_dim: size of the action.
         num_cells: widths of the hidden layers of every network.
         num_qvalue_nets: number of critics.
         perturbation: whether there is a perturbation network.
-        observation_dim: size of the observation.
-        action_dim: size of the action.
         **options: of :class:`BCQLoss`.
 
     Raises:
         BMRLError: for options that :class:`BCQLoss` refuses.
 
     Example:
-        >>> make_bcq_loss(num_cells=(8,), observation_dim=3, action_dim=2).num_qvalue_nets
+        >>> make_bcq_loss(observation_dim=3, action_dim=2, num_cells=(8,)).num_qvalue_nets
         2
     """
     dims = (observation_dim, action_dim)
@@ -86,7 +86,8 @@ def load_bcq_loss(path: Path) -> tuple[BCQLoss, dict[str, Any]]:
     Example:
         >>> import tempfile
         >>> from torchrl_bmrl.training.checkpoint import save_checkpoint
-        >>> path, options = Path(tempfile.mkdtemp()) / "a.safetensors", {"num_cells": [8]}
+        >>> path = Path(tempfile.mkdtemp()) / "a.safetensors"
+        >>> options = {"observation_dim": 3, "action_dim": 2, "num_cells": [8]}
         >>> state = {"module": make_bcq_loss(**options).state_dict()}
         >>> save_checkpoint(path, state, {"kind": "bcq", "task": "lift", "loss": options})
         >>> loss, metadata = load_bcq_loss(path)
@@ -94,7 +95,15 @@ def load_bcq_loss(path: Path) -> tuple[BCQLoss, dict[str, Any]]:
         (['action'], 'lift')
     """
     state, metadata = load_checkpoint(path, kind="bcq")
-    return build(make_bcq_loss, metadata.get("loss"), state, path), metadata
+    options = _with_sizes(metadata.get("loss"))
+    return build(make_bcq_loss, options, state, path), metadata
+
+
+def _with_sizes(options: Any) -> Any:
+    """Options of networks, with the sizes that older checkpoints leave out."""
+    if not isinstance(options, dict):
+        return options  # refused when the networks are built
+    return _SIX_TASKS | {key: x for key, x in options.items() if key != "target_dtype"}
 
 
 class Student(nn.Module):
@@ -102,12 +111,12 @@ class Student(nn.Module):
 
     Args:
         num_tasks: number of teachers.
-        task_encoder: ``"transition"``, or ``"one_hot"``: m is the task's index, one-hot.
-        task_latent_dim: size of m where it is not one-hot.
-        num_cells: widths of the hidden layers.
-        latent_dim: size of ``action_latent``, the teachers'.
         observation_dim: size of the observation.
         action_dim: size of the action.
+        task_encoder: ``"transition"``, or ``"one_hot"``: m is the task's index, one-hot.
+        task_latent_dim: size of m if it is not one-hot.
+        num_cells: widths of the hidden layers.
+        latent_dim: size of the teachers' ``action_latent``; by default twice the action's.
 
     Attributes:
         prototypes: m that stands for each task, ``(num_tasks, m)``; see :meth:`set_prototypes`.
@@ -116,7 +125,7 @@ class Student(nn.Module):
         UnknownNameError: for another encoder.
 
     Example:
-        >>> student = Student(num_tasks=2, num_cells=(8,))
+        >>> student = Student(num_tasks=2, observation_dim=3, action_dim=2, num_cells=(8,))
         >>> student.policy(num_candidates=10, latent_clip=0.5).in_keys
         ['observation', 'task_latent']
         >>> student.task_latent_source("prototype", task=1).task_latent
@@ -129,16 +138,16 @@ class Student(nn.Module):
         self,
         *,
         num_tasks: int,
+        observation_dim: int,
+        action_dim: int,
         task_encoder: str = "transition",
         task_latent_dim: int = 2,
         num_cells: Sequence[int] = (256, 256),
-        latent_dim: int = 2 * ACTION_DIM,
-        observation_dim: int = OBSERVATION_DIM,
-        action_dim: int = ACTION_DIM,
+        latent_dim: int | None = None,
     ) -> None:
         super().__init__()
         dims = (observation_dim, action_dim)
-        self.latent_dim = latent_dim
+        self.latent_dim = latent_dim = 2 * action_dim if latent_dim is None else latent_dim
         if task_encoder not in TASK_ENCODERS:
             raise UnknownNameError("task encoder", task_encoder, TASK_ENCODERS)
         if task_encoder == "one_hot":
@@ -247,8 +256,9 @@ def make_distillation_loss(
         BMRLError: for options that :class:`MetaDistillationLoss` refuses.
 
     Example:
-        >>> teachers = [BCQPolicy.frozen(make_bcq_loss(num_cells=(8,))) for _ in range(2)]
-        >>> make_distillation_loss(Student(num_tasks=2), teachers).num_tasks
+        >>> sizes = {"observation_dim": 3, "action_dim": 2}
+        >>> teachers = [BCQPolicy.frozen(make_bcq_loss(**sizes)) for _ in range(2)]
+        >>> make_distillation_loss(Student(num_tasks=2, **sizes), teachers).num_tasks
         2
     """
     return MetaDistillationLoss(
@@ -285,7 +295,8 @@ def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
     Example:
         >>> import tempfile
         >>> from torchrl_bmrl.training.checkpoint import save_checkpoint
-        >>> path, options = Path(tempfile.mkdtemp()) / "a.safetensors", {"num_tasks": 1}
+        >>> path = Path(tempfile.mkdtemp()) / "a.safetensors"
+        >>> options = {"num_tasks": 1, "observation_dim": 33, "action_dim": 7}
         >>> metadata = {"kind": "student", "student": options, "tasks": ["lift"], "accuracy": 0.99}
         >>> metadata |= {"latent_clip": 0.5, "statistics": {"loc": [0.0] * 33, "scale": [1.0] * 33}}
         >>> save_checkpoint(path, {"module": Student(**options).state_dict()}, metadata)
@@ -294,12 +305,12 @@ def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
         ['lift']
     """
     state, metadata = load_checkpoint(path, kind="student")
-    student = build(Student, metadata.get("student"), state, path)
+    student = build(Student, _with_sizes(metadata.get("student")), state, path)
     number = len(student.prototypes)
     valid: dict[str, tuple[Callable[[Any], bool], str]] = {
         "tasks": (
-            lambda x: isinstance(x, list) and len(x) == number and all(y in TASKS for y in x),
-            f"{number} of {', '.join(TASKS)}, one per prototype",
+            lambda x: isinstance(x, list) and len(x) == number and all(map(_is_name, x)),
+            f"{number} different names, one per prototype",
         ),
         "latent_clip": (lambda x: x is None or (_is_number(x) and x > 0), "a number above 0, null"),
         "accuracy": (lambda x: _is_number(x) and 0 <= x <= 1, "a number between 0 and 1"),
@@ -316,8 +327,15 @@ def _is_number(x: Any) -> bool:
     return isinstance(x, float | int) and math.isfinite(x)
 
 
+def _is_name(x: Any) -> bool:
+    return isinstance(x, str) and 0 < len(x) <= 200
+
+
 def _are_statistics(x: Any) -> bool:
-    if not isinstance(x, dict) or set(x) != {"loc", "scale"}:
+    if not isinstance(x, dict) or set(x) - {"parts"} != {"loc", "scale"}:
+        return False
+    parts = x.get("parts", [])
+    if not isinstance(parts, list) or not all(map(_is_name, parts)):
         return False
     lists = isinstance(x["loc"], list) and isinstance(x["scale"], list)
     return (

@@ -1,0 +1,71 @@
+"""Any gymnasium environment with continuous actions as a task's environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import torch
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, GymEnv, SerialEnv, TransformedEnv
+from torchrl.envs.gym_like import default_info_dict_reader
+from torchrl.envs.transforms import ActionScaling, RenameTransform
+
+from torchrl_bmrl.errors import ConfigError
+from torchrl_bmrl.extras import needs
+
+
+def make_gym_env(
+    *,
+    num_envs: int | None = None,
+    env: str,
+    env_options: Mapping[str, Any] | None = None,
+    success: str | None = None,
+) -> EnvBase:
+    """A registered gymnasium environment, or several side by side; actions lie in [-1, 1].
+
+    Args:
+        num_envs: number of environments; ``None`` for one without a batch dimension.
+        env: gymnasium's id, such as ``"HalfCheetah-v5"`` or ``"module:MyEnv-v0"``.
+        env_options: keyword arguments of ``gymnasium.make``.
+        success: key of ``info`` that becomes ``success (*B,)``; ``None``: there is none.
+
+    Returns:
+        an environment with batch ``[]`` or ``[num_envs]``.
+
+    Raises:
+        ConfigError: if gymnasium cannot make it, or its actions are not bounded numbers.
+
+    Example:
+        >>> env = make_gym_env(env="Pendulum-v1", num_envs=2)
+        >>> env.rollout(3)["next", "observation"].shape
+        torch.Size([2, 3, 3])
+    """
+    with needs("robosuite"):
+        import gymnasium
+
+    make = partial(_make_one, env, dict(env_options or {}), success)
+    try:
+        made = make() if num_envs is None else SerialEnv(num_envs, make)
+    except (gymnasium.error.Error, ImportError, TypeError) as error:
+        raise ConfigError(f"env is {env}: gymnasium cannot make it ({error})") from error
+    space = made.action_spec.space
+    if not isinstance(made.action_spec, Bounded) or not (space.high - space.low).isfinite().all():
+        raise ConfigError(
+            f"env is {env}, whose actions are {made.action_spec}; valid: numbers between bounds"
+        )
+    return TransformedEnv(made, ActionScaling())
+
+
+def _make_one(env: str, env_options: dict[str, Any], success: str | None) -> EnvBase:
+    one = GymEnv(env, **env_options)
+    if success is None:
+        return one
+    spec = Composite({success: Unbounded((), dtype=torch.bool)})
+    one.set_info_dict_reader(default_info_dict_reader([success], spec=spec))
+    return (
+        one
+        if success == "success"
+        else TransformedEnv(one, RenameTransform([success], ["success"]))
+    )

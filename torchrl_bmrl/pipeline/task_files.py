@@ -1,0 +1,127 @@
+"""Tasks of a run: registered names, or a YAML file that describes a user's own tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from torchrl_bmrl.data.options import ReadOptions
+from torchrl_bmrl.envs.gym import make_gym_env
+from torchrl_bmrl.errors import ConfigError
+from torchrl_bmrl.run.folder import read_yaml
+from torchrl_bmrl.tasks import DemonstrationFiles, Task, get_task
+
+_OF_FILES = (
+    "demonstrations",
+    "read",
+    "valid_share",
+    "env",
+    "env_options",
+    "horizon",
+    "success",
+    "parts",
+    "title",
+)
+
+
+def read_task_file(path: str | Path) -> dict[str, dict[str, Any]]:
+    """Reads a YAML file of tasks.
+
+    Args:
+        path: the file: a mapping from each task's name to its description.
+
+    Returns:
+        the descriptions by name; paths in them are absolute.
+
+    Raises:
+        DataError: if the file is missing or not YAML.
+        ConfigError: if it does not describe tasks.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "mine.yaml"
+        >>> _ = path.write_text("door: {demonstrations: /data/door.hdf5}")
+        >>> read_task_file(path)
+        {'door': {'demonstrations': '/data/door.hdf5'}}
+    """
+    path = Path(path)
+    content = read_yaml(path)
+    if not content or not all(isinstance(entry, dict) for entry in content.values()):
+        raise ConfigError(f"{path}: valid: a mapping from each task's name to its description")
+    tasks = {str(name): dict(entry) for name, entry in content.items()}
+    for entry in tasks.values():
+        if isinstance(entry.get("demonstrations"), str):
+            entry["demonstrations"] = str((path.parent / entry["demonstrations"]).absolute())
+    make_tasks(tasks)
+    return tasks
+
+
+def make_tasks(tasks: Sequence[str] | Mapping[str, Mapping[str, Any]]) -> tuple[Task, ...]:
+    """The tasks that settings describe.
+
+    Args:
+        tasks: names (:func:`~torchrl_bmrl.tasks.get_task`), or descriptions by name as in a
+            :func:`read_task_file`.
+
+    Returns:
+        the tasks in their order; a task's class index is its position.
+
+    Raises:
+        UnknownNameError: for a name that is not registered.
+        ConfigError: for a description that is not valid, no task at all, or one that comes twice.
+
+    Example:
+        >>> [task.title for task in make_tasks(["lift", "push_left"])]
+        ['Lift', 'Push left']
+        >>> (task,) = make_tasks({"panda_lift": {"task": "lift"}})
+        >>> task.name
+        'panda_lift'
+    """
+    if isinstance(tasks, Mapping):
+        made = [_make_task(name, entry) for name, entry in tasks.items()]
+    elif isinstance(tasks, Sequence) and not isinstance(tasks, str):
+        made = [get_task(name) for name in tasks]
+    else:
+        raise ConfigError(f"tasks is {tasks!r}; valid: a list of names, or a YAML file of tasks")
+    names = [task.name for task in made]
+    if not made or len(set(names)) < len(names):
+        raise ConfigError(f"tasks is {names}; valid: at least one task, each once")
+    return tuple(made)
+
+
+def _make_task(name: str, entry: Mapping[str, Any]) -> Task:
+    """A task of its description: a registered task with other options, or a user's files."""
+    if "task" in entry:
+        task = get_task(str(entry["task"]))
+        options = {key: x for key, x in entry.items() if key not in ("task", "title")}
+        title = str(entry.get("title", ""))
+        return replace(task.with_options(**options), name=name, title=title)
+    if "demonstrations" not in entry:
+        raise ConfigError(
+            f"task {name} has {', '.join(entry) or 'nothing'}; valid: demonstrations (a file or "
+            "folder) or task (the name of a registered one)"
+        )
+    for key in entry:
+        if key not in _OF_FILES:
+            raise ConfigError(f"task {name}: unknown key {key!r}; valid: {', '.join(_OF_FILES)}")
+    read = entry.get("read") or {}
+    ReadOptions.from_mapping(read)  # refused here and not in the middle of a run
+    parts, env, success = entry.get("parts"), entry.get("env"), entry.get("success")
+    files = DemonstrationFiles(
+        path=str(entry["demonstrations"]),
+        read=read,
+        valid_share=float(entry.get("valid_share", 0.1)),
+    )
+    options = {"env": env, "env_options": entry.get("env_options"), "success": success}
+    return Task(
+        name=name,
+        files=files,
+        make_env=None if env is None else make_gym_env,
+        options={} if env is None else options,
+        parts=None if parts is None else tuple(parts),
+        horizon=entry.get("horizon"),
+        success=None if success is None else "success",
+        title=str(entry.get("title", "")),
+    )
