@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,14 @@ from torchrl_bmrl.data.account import Account
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.options import ReadOptions
 from torchrl_bmrl.data.schema import Layout, check_episode, check_fps, layout_of
-from torchrl_bmrl.data.sources import Source, find_format, joined, open_source, with_joint_range
+from torchrl_bmrl.data.sources import (
+    Source,
+    find_format,
+    joined,
+    open_source,
+    open_sources,
+    with_joint_range,
+)
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
 
 __all__ = ["TARGETS", "Conversion", "convert", "find_format", "open_source"]
@@ -87,35 +94,37 @@ def convert(
     """
     if to not in TARGETS:
         raise UnknownNameError("format", to, TARGETS)
-    given = [source] if isinstance(source, str | os.PathLike) else list(source)
-    if not given:
-        raise ConfigError("no source; valid: at least one")
     if fps is not None:
         check_fps(fps)
     target = Path(target).expanduser()
     # Once: an iterator of keys is at its end after the first source.
     options = vars(ReadOptions(**options))
-    with ExitStack() as stack:
-        sources = [
-            stack.enter_context(open_source(Path(path), task=task, tracking=tracking, **options))
-            for path in given
-        ]
-        for data in sources:
-            data.check()
-        passing = _Passing(with_joint_range(sources), report)
-        try:
-            if os.path.lexists(target):
-                raise DataError(target, None, "exists; valid: a new name")
-            _write(target, to, passing, fps)
-        except BMRLError:
-            raise
-        except (OSError, RuntimeError) as error:  # RuntimeError: how h5py reports a full disk
-            raise DataError(target, None, f"cannot be written ({error})") from error
-        return Conversion(account=passing.account, notes=tuple(passing.notes(to)))
+    with open_sources(source, task=task, tracking=tracking, **options) as sources:
+        stream = Stream(with_joint_range(sources), report)
+        with writing(target):
+            _write(target, to, stream, fps)
+        return Conversion(account=stream.account, notes=tuple(stream.notes(to)))
 
 
-class _Passing:
-    """The episodes of all sources on their way to a writer: checked, and counted.
+@contextmanager
+def writing(target: Path) -> Iterator[None]:
+    """Refuses a target that exists, and reports in one way what the file system refuses.
+
+    Raises:
+        DataError: if the target exists or cannot be written.
+    """
+    try:
+        if os.path.lexists(target):
+            raise DataError(target, None, "exists; valid: a new name")
+        yield
+    except BMRLError:
+        raise
+    except (OSError, RuntimeError) as error:  # RuntimeError: how h5py reports a full disk
+        raise DataError(target, None, f"cannot be written ({error})") from error
+
+
+class Stream:
+    """The episodes of all sources on their way to a writer: each is checked and counted.
 
     Args:
         sources: open, in order.
@@ -126,6 +135,9 @@ class _Passing:
         self.sources, self.report = sources, report
         self.metadata = joined(sources)
         self.account = Account()
+        # What their file's attributes would say again: masks and totals are written anew.
+        structure = ("env_args", "masks", "total", "action_bounds")
+        self.attributes_of_file = {k: v for k, v in self.metadata.items() if k not in structure}
         self.extras: dict[str, None] = {}
         self.attributes: dict[str, None] = {}
         self.rounded = self.whole_numbers = self.bounded = False
@@ -215,30 +227,25 @@ class _Passing:
             yield f"left out, as the data set has no place for it: {names}"
 
 
-def _write(target: Path, to: str, passing: _Passing, fps: float | None) -> None:
-    metadata = passing.metadata
+def _write(target: Path, to: str, stream: Stream, fps: float | None) -> None:
+    metadata = stream.metadata
     env_args = metadata["env_args"]
     name = metadata.get("task") or env_args.get("env_name") or target.name
-    bounds = passing.sources[0].bounds
+    bounds = stream.sources[0].bounds
     if to == "robomimic":
-        kept = {
-            key: value
-            for key, value in metadata.items()
-            if key not in ("env_args", "masks", "total", "action_bounds")
-        } | ({} if fps is None else {"fps": fps})
         robomimic.write_episodes(
             target,
-            passing,
+            stream,
             env_args=env_args,
-            attributes=kept,
+            attributes=stream.attributes_of_file | ({} if fps is None else {"fps": fps}),
             masks=metadata["masks"],
             bounds=bounds,
         )
         return
-    fps = passing.fps if fps is None else fps
+    fps = stream.fps if fps is None else fps
     if to == "minari":
-        minari.write_episodes(target, passing, fps=fps, description=str(name), bounds=bounds)
+        minari.write_episodes(target, stream, fps=fps, description=str(name), bounds=bounds)
     elif fps is None:
         raise ConfigError("the source does not tell its steps per second; valid: --fps")
     else:
-        lerobot.write_episodes(target, passing, fps=fps, task=str(name))
+        lerobot.write_episodes(target, stream, fps=fps, task=str(name))

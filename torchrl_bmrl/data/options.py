@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-from torchrl_bmrl.errors import ConfigError
+from torchrl_bmrl.errors import ConfigError, UnknownNameError
 
 LastStep = Literal["drop", "truncate", "terminate"]
 Reward = Literal["success", "last"]
@@ -58,6 +58,31 @@ class ReadOptions:
     successful: bool = False
     bounds: Bounds | Literal["data"] | None = None
     horizon: int | None = None
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any] | None) -> ReadOptions:
+        """Options from a plain mapping, such as a section of a YAML file.
+
+        Args:
+            mapping: values by the options' names; ``None`` for the defaults.
+
+        Raises:
+            ConfigError: for anything else than a mapping, and for invalid values.
+            UnknownNameError: for a key that is not an option.
+
+        Example:
+            >>> ReadOptions.from_mapping({"reward": "success", "bounds": [-2, 2]}).bounds
+            (-2.0, 2.0)
+        """
+        if mapping is None:
+            return cls()
+        if not isinstance(mapping, Mapping):
+            raise ConfigError(f"the options are {mapping!r}; valid: a mapping of names to values")
+        valid = [field.name for field in fields(cls)]
+        for key in mapping:
+            if key not in valid:
+                raise UnknownNameError("option", key, valid)
+        return cls(**mapping)
 
     def __post_init__(self) -> None:
         keys = self.observation_keys

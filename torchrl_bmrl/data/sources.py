@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +42,7 @@ class Source:
         prefix: of the names inside the file, for messages.
         bounds: of floating-point actions: those of the options, else those that the data set
             states, else [-1, 1].
+        bounds_stated: whether the options or the data set state these bounds.
         metadata: attributes of the file, ``env_args`` and ``masks`` among them, and
             ``action_bounds`` where they are not [-1, 1].
         account: knows the episodes that are left out; whoever reads the others adds them.
@@ -53,6 +56,7 @@ class Source:
     options: ReadOptions = field(default_factory=ReadOptions)
     prefix: str = ""
     bounds: Bounds = (-1.0, 1.0)
+    bounds_stated: bool = False
     metadata: Mapping[str, Any] = field(default_factory=dict)
     account: Account = field(default_factory=Account)
     problems: Sequence[tuple[str, str]] = ()
@@ -175,6 +179,30 @@ def open_source(
         yield _apply(path, form, opened, chosen)
 
 
+@contextmanager
+def open_sources(
+    source: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], **options: Any
+) -> Iterator[list[Source]]:
+    """Opens one or several data sets, and refuses those with problems beside their episodes.
+
+    Args:
+        source: a path as for :func:`open_source`, or several.
+        options: as for :func:`open_source`.
+
+    Raises:
+        ConfigError: without a source, and as :func:`open_source`.
+        DataError: as :func:`open_source`.
+    """
+    paths = [source] if isinstance(source, str | os.PathLike) else list(source)
+    if not paths:
+        raise ConfigError("no source; valid: at least one")
+    with ExitStack() as stack:
+        sources = [stack.enter_context(open_source(Path(path), **options)) for path in paths]
+        for opened in sources:
+            opened.check()
+        yield sources
+
+
 def _apply(path: Path, form: str, opened: _Opened, options: ReadOptions) -> Source:
     """Applies the options to what a format's reader has opened."""
     account = Account()
@@ -183,7 +211,7 @@ def _apply(path: Path, form: str, opened: _Opened, options: ReadOptions) -> Sour
     stated = metadata.pop("action_bounds", None)
     bounds: Bounds = (-1.0, 1.0)
     if options.bounds == "data":
-        bounds = _range_of_actions(opened.episodes, names)
+        bounds = range_of_actions(opened.episodes, names)
     elif options.bounds is not None:
         bounds = options.bounds
     elif stated is not None:
@@ -201,6 +229,7 @@ def _apply(path: Path, form: str, opened: _Opened, options: ReadOptions) -> Sour
         options=options,
         prefix=opened.prefix,
         bounds=bounds,
+        bounds_stated=options.bounds is not None or stated is not None,
         metadata=metadata,
         account=account,
         problems=opened.problems,
@@ -231,10 +260,11 @@ def _choose(path: Path, opened: _Opened, options: ReadOptions, account: Account)
     return names
 
 
-def _range_of_actions(episodes: Mapping[str, RawEpisode], names: list[str]) -> Bounds:
-    """Smallest and largest action in each dimension, ±1 around one that is constant.
+def range_of_actions(episodes: Mapping[str, Episode | RawEpisode], names: Iterable[str]) -> Bounds:
+    """Smallest and largest action in each dimension, and ±1 around a constant dimension.
 
-    Of actions that are no vectors it is one range for all numbers; whole numbers have no bounds.
+    Actions that are not vectors have one range for all numbers. Integer actions have no bounds:
+    the result is [-1, 1].
     """
     low, high = np.array(np.inf), np.array(-np.inf)
     for name in names:
@@ -317,20 +347,50 @@ def _open_robosuite(stack: ExitStack, path: Path, task: str | None, tracking: fl
     )
 
 
+def join_bounds(bounds: Sequence[Bounds]) -> Bounds:
+    """The narrowest bounds that contain all of the given ones.
+
+    Args:
+        bounds: at least one.
+
+    Raises:
+        ConfigError: if they have different numbers of dimensions.
+
+    Example:
+        >>> join_bounds([(-1.0, 1.0), ((-2.0, 0.0), (0.5, 0.5))])
+        ((-2.0, -1.0), (1.0, 1.0))
+    """
+    arrays: list[list[Any]] = [[np.asarray(end, dtype=float) for end in pair] for pair in bounds]
+    try:
+        low = reduce(np.minimum, [low for low, _ in arrays])
+        high = reduce(np.maximum, [high for _, high in arrays])
+    except ValueError as error:
+        sizes = sorted({end.size for pair in arrays for end in pair if end.ndim})
+        message = f"the actions' bounds have {sizes} dimensions; valid: equally many"
+        raise ConfigError(message) from error
+    return check_bounds((low, high))
+
+
+def with_bounds(sources: Iterable[Source], bounds: Bounds) -> list[Source]:
+    """The sources with other bounds of the actions."""
+    stated = (
+        {} if bounds == (-1.0, 1.0) else {"action_bounds": {"low": bounds[0], "high": bounds[1]}}
+    )
+    changed = []
+    for source in sources:
+        kept = {key: value for key, value in source.metadata.items() if key != "action_bounds"}
+        changed.append(replace(source, bounds=bounds, metadata=kept | stated))
+    return changed
+
+
 def with_joint_range(sources: Sequence[Source]) -> list[Source]:
-    """The sources, bounded by the range of all their actions if they are by their own."""
+    """The sources, bounded by the range of all of their actions if the option ``bounds`` asks."""
     if sources[0].options.bounds != "data" or len(sources) == 1:
         return list(sources)
-    lows, highs = zip(*(source.bounds for source in sources), strict=True)
     try:
-        low, high = np.min(np.stack(lows), axis=0), np.max(np.stack(highs), axis=0)
-    except ValueError:  # of other sizes, which whoever reads the episodes says
+        return with_bounds(sources, join_bounds([source.bounds for source in sources]))
+    except ConfigError:  # whoever reads the episodes reports actions of different sizes
         return list(sources)
-    bounds = check_bounds((low, high))
-    told = {} if bounds == (-1.0, 1.0) else {"action_bounds": {"low": bounds[0], "high": bounds[1]}}
-    return [
-        replace(source, bounds=bounds, metadata={**source.metadata, **told}) for source in sources
-    ]
 
 
 def _equal(one: Bounds, other: Bounds) -> bool:

@@ -1,0 +1,279 @@
+"""A user's file of any format becomes the file that a run trains on."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+pytest.importorskip("h5py")
+pytest.importorskip("tqdm")
+
+import h5py
+from episode_files import ENV_ARGS, assert_same, make_episode, write_file
+
+from torchrl_bmrl.data import Episode, lerobot, minari, robomimic
+from torchrl_bmrl.data.datasets import RobomimicExperienceReplay
+from torchrl_bmrl.data.importing import (
+    find_action_bounds,
+    import_demonstrations,
+    read_original_bounds,
+)
+from torchrl_bmrl.data.options import ReadOptions
+from torchrl_bmrl.data.sources import join_bounds
+from torchrl_bmrl.errors import ConfigError, DataError, UnknownNameError
+
+
+def read(path: Path) -> list[Episode]:
+    with robomimic.open_episodes(path) as episodes:
+        return list(episodes.values())
+
+
+def masks(path: Path) -> dict[str, list[str]]:
+    return robomimic.read_metadata(path)["masks"]
+
+
+def in_units(episode: Episode, low: Any, high: Any) -> Episode:
+    """The same episode whose actions in [-1, 1] are stretched to other bounds."""
+    low, high = np.asarray(low), np.asarray(high)
+    actions = low + (episode.actions.astype(np.float64) + 1) / 2 * (high - low)
+    return replace(episode, actions=actions)
+
+
+def write_d4rl(path: Path, *, ends: tuple[int, ...] = (9, 19, 29), **changes: Any) -> Path:
+    rng, rows = np.random.default_rng(0), np.arange(30)
+    arrays = {
+        "observations": rng.standard_normal((30, 3)).astype("f4"),
+        "actions": rng.uniform(-1, 1, (30, 2)).astype("f4"),
+        "rewards": rng.random(30).astype("f4"),
+        "terminals": rows == 9,
+        "timeouts": np.isin(rows, ends) & (rows != 9),
+    } | changes
+    with h5py.File(path, "w") as file:
+        for key, array in arrays.items():
+            file[key] = array
+    return path
+
+
+# -- formats ---------------------------------------------------------------------------------------
+
+
+def test_a_file_in_range_with_both_masks_is_copied(tmp_path: Path) -> None:
+    made = write_file(tmp_path / "own.hdf5")
+    done = import_demonstrations(tmp_path / "own.hdf5", tmp_path / "lift.hdf5")
+    for ours, theirs in zip(read(tmp_path / "lift.hdf5"), made, strict=True):
+        assert_same(ours, theirs)
+    assert masks(tmp_path / "lift.hdf5") == masks(tmp_path / "own.hdf5")
+    assert done.account.read.steps == sum(map(len, made))
+    assert read_original_bounds(tmp_path / "lift.hdf5") == (-1.0, 1.0)
+    assert read_original_bounds(tmp_path / "own.hdf5") is None
+
+
+def test_d4rl_is_scaled_by_its_range_and_keeps_terminations(tmp_path: Path) -> None:
+    actions = np.random.default_rng(1).uniform(-3, 5, (30, 2)).astype("f4")
+    path = write_d4rl(tmp_path / "hopper.hdf5", actions=actions)
+    options = ReadOptions(last_step="truncate")
+    import_demonstrations(path, tmp_path / "hopper_run.hdf5", options=options)
+    episodes = read(tmp_path / "hopper_run.hdf5")
+    assert [len(episode) for episode in episodes] == [10, 10, 10]
+    assert [bool(episode.terminated[-1]) for episode in episodes] == [True, False, False]
+    low, high = read_original_bounds(tmp_path / "hopper_run.hdf5")
+    assert_allclose((low, high), (actions.min(0), actions.max(0)))
+    scaled = np.concatenate([episode.actions for episode in episodes])
+    assert scaled.dtype == np.float32
+    assert scaled.min() == -1
+    assert scaled.max() == 1
+    assert_allclose(low + (scaled + 1) / 2 * (np.array(high) - low), actions, atol=1e-6)
+
+
+def test_minari_is_scaled_by_the_bounds_of_its_space(tmp_path: Path) -> None:
+    pytest.importorskip("minari")
+    low, high = (-0.5,) * 7, (2.0,) * 6 + (1.0,)
+    made = [make_episode(i) for i in range(3)]
+    minari.write_episodes(
+        tmp_path / "own" / "lift-v0", [in_units(x, low, high) for x in made], bounds=(low, high)
+    )
+    import_demonstrations(tmp_path / "own" / "lift-v0", tmp_path / "lift.hdf5")
+    assert read_original_bounds(tmp_path / "lift.hdf5") == (low, high)
+    for ours, theirs in zip(read(tmp_path / "lift.hdf5"), made, strict=True):
+        assert_allclose(ours.actions, theirs.actions, atol=1e-6)
+        assert_array_equal(ours.extras["successes"], theirs.extras["successes"])
+
+
+def test_lerobot_is_imported_with_its_rewards_and_successes(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    parts = {"joints": ((4,), np.float32)}
+    made = [make_episode(i, parts=parts) for i in range(3)]
+    lerobot.write_episodes(tmp_path / "own", made, fps=20, task="lift")
+    options = ReadOptions(last_step="truncate")
+    import_demonstrations(tmp_path / "own", tmp_path / "lift.hdf5", options=options)
+    for ours, theirs in zip(read(tmp_path / "lift.hdf5"), made, strict=True):
+        assert_array_equal(ours.actions, theirs.actions)
+        assert_allclose(ours.rewards, theirs.rewards, rtol=1e-6)
+        assert_array_equal(ours.extras["successes"], theirs.extras["successes"])
+    assert RobomimicExperienceReplay(tmp_path / "lift.hdf5", split="valid")[:]["episode"].numel()
+
+
+def test_a_folder_of_files_becomes_one_file(tmp_path: Path) -> None:
+    (tmp_path / "own").mkdir()
+    made = [write_file(tmp_path / "own" / f"{name}.hdf5", (5, 6), train=1) for name in "ab"]
+    import_demonstrations(tmp_path / "own", tmp_path / "lift.hdf5")
+    for ours, theirs in zip(read(tmp_path / "lift.hdf5"), made[0] + made[1], strict=True):
+        assert_same(ours, theirs)
+    assert masks(tmp_path / "lift.hdf5") == {
+        "train": ["demo_0", "demo_2"],
+        "valid": ["demo_1", "demo_3"],
+    }
+
+
+# -- bounds ----------------------------------------------------------------------------------------
+
+
+def test_several_tasks_are_scaled_by_their_joint_bounds(tmp_path: Path) -> None:
+    bounds = []
+    for name, end in (("lift", 2.0), ("reach", 4.0)):
+        episodes = [in_units(make_episode(i), -end, end / 2) for i in range(2)]
+        robomimic.write_episodes(
+            tmp_path / f"{name}.hdf5", episodes, env_args={}, bounds=(-end, end / 2)
+        )
+        bounds.append(find_action_bounds(tmp_path / f"{name}.hdf5"))
+    assert bounds == [(-2.0, 1.0), (-4.0, 2.0)]
+    joint = join_bounds(bounds)
+    assert joint == (-4.0, 2.0)
+    import_demonstrations(tmp_path / "lift.hdf5", tmp_path / "run.hdf5", bounds=joint)
+    before, after = read(tmp_path / "lift.hdf5")[0], read(tmp_path / "run.hdf5")[0]
+    assert_allclose((before.actions + 1) / 3, after.actions, atol=1e-9)
+    assert read_original_bounds(tmp_path / "run.hdf5") == joint
+
+
+def test_actions_outside_the_given_bounds_are_refused(tmp_path: Path) -> None:
+    write_file(tmp_path / "own.hdf5")
+    with pytest.raises(DataError, match="outside"):
+        import_demonstrations(tmp_path / "own.hdf5", tmp_path / "lift.hdf5", bounds=(-0.1, 0.1))
+    assert not (tmp_path / "lift.hdf5").exists()
+
+
+def test_a_file_that_was_imported_before_keeps_its_first_units(tmp_path: Path) -> None:
+    made = [in_units(make_episode(i), 0.0, 4.0) for i in range(2)]
+    robomimic.write_episodes(tmp_path / "own.hdf5", made, env_args={}, bounds=(0, 4))
+    import_demonstrations(tmp_path / "own.hdf5", tmp_path / "one.hdf5")
+    import_demonstrations(tmp_path / "one.hdf5", tmp_path / "two.hdf5")
+    assert read_original_bounds(tmp_path / "two.hdf5") == (0.0, 4.0)
+    import_demonstrations(tmp_path / "one.hdf5", tmp_path / "three.hdf5", bounds=(-2, 1))
+    assert read_original_bounds(tmp_path / "three.hdf5") == (-2.0, 4.0)
+
+
+def test_bounds_of_other_sizes_are_not_joined() -> None:
+    with pytest.raises(ConfigError, match=r"\[2, 3\] dimensions"):
+        join_bounds([((0, 0), (1, 1)), ((0, 0, 0), (1, 1, 1))])
+
+
+# -- masks -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("count", "share", "valid"),
+    [(2, 0.1, [1]), (20, 0.1, [9, 19]), (15, 0.1, [6, 13]), (3, 0.9, [0, 1])],
+)
+def test_episodes_are_held_out_at_equal_distances(
+    tmp_path: Path, count: int, share: float, valid: list[int]
+) -> None:
+    episodes = [make_episode(i) for i in range(count)]
+    robomimic.write_episodes(tmp_path / "own.hdf5", episodes, env_args=ENV_ARGS)
+    import_demonstrations(tmp_path / "own.hdf5", tmp_path / "lift.hdf5", valid_share=share)
+    assert masks(tmp_path / "lift.hdf5") == {
+        "train": [f"demo_{i}" for i in range(count) if i not in valid],
+        "valid": [f"demo_{i}" for i in valid],
+    }
+
+
+def test_a_mask_that_lost_all_of_its_episodes_is_chosen_anew(tmp_path: Path) -> None:
+    write_file(tmp_path / "own.hdf5")
+    options = ReadOptions(split="train")
+    import_demonstrations(tmp_path / "own.hdf5", tmp_path / "lift.hdf5", options=options)
+    assert masks(tmp_path / "lift.hdf5") == {"train": ["demo_0", "demo_1"], "valid": ["demo_2"]}
+
+
+# -- what is refused, and what is said -------------------------------------------------------------
+
+
+def test_a_single_episode_is_refused(tmp_path: Path) -> None:
+    robomimic.write_episodes(tmp_path / "own.hdf5", [make_episode()], env_args={})
+    with pytest.raises(DataError, match="one episode; valid: at least two"):
+        import_demonstrations(tmp_path / "own.hdf5", tmp_path / "lift.hdf5")
+
+
+def test_discrete_actions_are_refused(tmp_path: Path) -> None:
+    path = write_d4rl(tmp_path / "own.hdf5", actions=np.arange(30) % 4)
+    for refuse in (find_action_bounds, lambda x: import_demonstrations(x, tmp_path / "a.hdf5")):
+        with pytest.raises(DataError, match="stage 1 needs continuous actions"):
+            refuse(path)
+
+
+def test_missing_rewards_are_refused_until_an_option_says_them(tmp_path: Path) -> None:
+    path = tmp_path / "own.hdf5"
+    write_file(path)
+    with h5py.File(path, "r+") as file:
+        for demo in file["data"].values():
+            del demo["rewards"]
+    with pytest.raises(DataError, match=r"demo_0/rewards: missing; valid: .*option reward"):
+        import_demonstrations(path, tmp_path / "lift.hdf5")
+    options = ReadOptions(reward="success")
+    import_demonstrations(path, tmp_path / "lift.hdf5", options=options)
+    for episode in read(tmp_path / "lift.hdf5"):
+        assert_array_equal(episode.rewards, episode.extras["successes"])
+
+
+@pytest.mark.parametrize("share", [0, 1, -0.1, True])
+def test_a_share_that_leaves_a_mask_empty_is_refused(tmp_path: Path, share: float) -> None:
+    with pytest.raises(ConfigError, match="valid_share"):
+        import_demonstrations(tmp_path / "own.hdf5", tmp_path / "a.hdf5", valid_share=share)
+
+
+def test_a_target_that_exists_is_kept(tmp_path: Path) -> None:
+    write_file(tmp_path / "own.hdf5")
+    (tmp_path / "lift.hdf5").write_text("mine")
+    with pytest.raises(DataError, match="exists"):
+        import_demonstrations(tmp_path / "own.hdf5", tmp_path / "lift.hdf5")
+    assert (tmp_path / "lift.hdf5").read_text() == "mine"
+
+
+def test_what_is_left_out_or_changed_is_logged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_d4rl(tmp_path / "own.hdf5", actions=np.linspace(-2, 2, 60).reshape(30, 2))
+    with caplog.at_level(logging.INFO, "torchrl_bmrl"):
+        done = import_demonstrations(path, tmp_path / "lift.hdf5")
+    assert all(note in caplog.text for note in done.notes)
+    assert "left out: 2 last steps" in caplog.text
+    assert "actions were scaled from" in caplog.text
+    assert "2 episodes to train on, 1 held out (one in every 3)" in caplog.text
+
+
+# -- options from a mapping ------------------------------------------------------------------------
+
+
+def test_options_are_read_from_a_mapping() -> None:
+    options = ReadOptions.from_mapping(
+        {"observation_keys": ["x"], "bounds": [[-1, -2], 2], "last_step": "truncate"}
+    )
+    assert options == ReadOptions(
+        observation_keys=["x"], bounds=((-1, -2), 2), last_step="truncate"
+    )
+    assert ReadOptions.from_mapping(None) == ReadOptions.from_mapping({}) == ReadOptions()
+
+
+def test_a_key_that_is_no_option_is_refused_with_those_that_are() -> None:
+    with pytest.raises(
+        UnknownNameError, match=r"unknown option 'rewards'; valid options: .*reward"
+    ):
+        ReadOptions.from_mapping({"rewards": "last"})
+    with pytest.raises(ConfigError, match="a mapping"):
+        ReadOptions.from_mapping(["reward"])
+    with pytest.raises(ConfigError, match="reward is 'end'"):
+        ReadOptions.from_mapping({"reward": "end"})

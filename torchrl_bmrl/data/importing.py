@@ -1,0 +1,257 @@
+"""Demonstrations of any format become the file that a run trains on."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from torchrl_bmrl.data import robomimic
+from torchrl_bmrl.data.convert import Conversion, Stream, writing
+from torchrl_bmrl.data.episodes import Episode
+from torchrl_bmrl.data.options import Bounds, ReadOptions, check_bounds
+from torchrl_bmrl.data.robomimic_file import MASKS
+from torchrl_bmrl.data.sources import (
+    Source,
+    join_bounds,
+    open_sources,
+    range_of_actions,
+    with_bounds,
+)
+from torchrl_bmrl.errors import ConfigError, DataError
+
+ORIGINAL_BOUNDS = "original_action_bounds"
+"""Attribute of ``data``: the bounds that the actions had before they were scaled to [-1, 1]."""
+
+log = logging.getLogger(__name__)
+
+Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
+
+
+def import_demonstrations(
+    source: Paths,
+    target: str | os.PathLike[str],
+    *,
+    options: ReadOptions | None = None,
+    task: str | None = None,
+    tracking: float = 1.0,
+    valid_share: float = 0.1,
+    bounds: Bounds | None = None,
+    report: Callable[[int], object] = lambda _: None,
+) -> Conversion:
+    """Writes a user's demonstrations into one file in robomimic's layout, ready for training.
+
+    Actions are scaled to [-1, 1]. Two masks tell the episodes to train on (``train``) from those
+    that are held out (``valid``): the sources' own, if every source has both, else every k-th
+    episode is held out. Observations, rewards, terminations, successes, other arrays and attributes
+    are copied. Notes on what was changed or left out are logged.
+
+    Args:
+        source: a file or data set folder of any format that
+            :func:`~torchrl_bmrl.data.sources.open_source` reads, a folder of HDF5 files, or a
+            list of such paths. Several become one.
+        target: the new HDF5 file.
+        options: how the source is read; the defaults if ``None``.
+        task: whose scene a robosuite ``demo.hdf5`` was recorded in.
+        tracking: see :func:`torchrl_bmrl.data.robosuite.open_episodes`.
+        valid_share: share of the episodes to hold out, of which there is at least one.
+        bounds: lowest and highest action, which become -1 and 1; those of
+            :func:`find_action_bounds` if ``None``. The file stores them, see
+            :func:`read_original_bounds`.
+        report: called with 1 after every episode.
+
+    Returns:
+        what was read, and notes on what was changed or left out.
+
+    Raises:
+        ConfigError: for invalid options.
+        DataError: naming file, key and row for data that cannot be trained on, for discrete
+            actions, missing rewards, a single episode, and for a target that exists or cannot be
+            written.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> x, r = {"x": np.zeros((5, 3))}, np.zeros(5)
+        >>> episode = Episode(
+        ...     observations=x,
+        ...     next_observations=x,
+        ...     actions=np.full((5, 2), 0.25),
+        ...     rewards=r,
+        ...     terminated=r > 0,
+        ... )
+        >>> robomimic.write_episodes(folder / "own.hdf5", [episode] * 20, env_args={})
+        >>> done = import_demonstrations(
+        ...     folder / "own.hdf5", folder / "lift.hdf5", bounds=(-0.5, 0.5)
+        ... )
+        >>> (
+        ...     done.account.read.steps,
+        ...     len(robomimic.read_metadata(folder / "lift.hdf5")["masks"]["valid"]),
+        ... )
+        (100, 2)
+        >>> with robomimic.open_episodes(folder / "lift.hdf5") as episodes:
+        ...     episodes["demo_0"].actions[0].tolist()
+        [0.5, 0.5]
+        >>> read_original_bounds(folder / "lift.hdf5")
+        (-0.5, 0.5)
+    """
+    if isinstance(valid_share, bool) or not 0 < valid_share < 1:
+        raise ConfigError(f"valid_share is {valid_share!r}; valid: a number between 0 and 1")
+    chosen = None if bounds is None else check_bounds(bounds)
+    target = Path(target).expanduser()
+    reading = vars(options or ReadOptions())
+    with open_sources(_expand(source), task=task, tracking=tracking, **reading) as sources:
+        _check_actions(sources)
+        bounds = chosen or _bounds_of(sources)
+        stream = Stream(with_bounds(sources, bounds), report)
+        if len(stream.names) < 2:
+            message = "one episode; valid: at least two, one to train on and one to hold out"
+            raise DataError(sources[0].path, None, message)
+        masks, how = _masks(stream, valid_share)
+        original = _original_bounds(stream, bounds)
+        with writing(target):
+            robomimic.write_episodes(
+                target,
+                (_scaled(episode, bounds) for episode in stream),
+                env_args=stream.metadata["env_args"],
+                attributes=stream.attributes_of_file
+                | {ORIGINAL_BOUNDS: json.dumps({"low": original[0], "high": original[1]})},
+                masks=masks,
+            )
+        notes = [*stream.notes("robomimic")]
+    if bounds != (-1.0, 1.0):
+        notes.append(f"actions were scaled from {bounds[0]} to {bounds[1]} to [-1, 1]")
+    train, valid = (len(masks[mask]) for mask in MASKS)
+    notes.append(f"{train} episodes to train on, {valid} held out ({how})")
+    for note in notes:
+        log.info("%s: %s", target, note)
+    return Conversion(account=stream.account, notes=tuple(notes))
+
+
+def find_action_bounds(
+    source: Paths,
+    *,
+    options: ReadOptions | None = None,
+    task: str | None = None,
+    tracking: float = 1.0,
+) -> Bounds:
+    """Lowest and highest action of the demonstrations of one task.
+
+    They are those of ``options.bounds``, else those that the file states, else [-1, 1] if all
+    actions lie in that range, else each dimension's smallest and largest action. Several sources
+    have the bounds that contain those of each. :func:`~torchrl_bmrl.data.sources.join_bounds`
+    joins the bounds of several tasks.
+
+    Args:
+        source: as for :func:`import_demonstrations`.
+        options: how the source is read; the defaults if ``None``.
+        task: as for :func:`import_demonstrations`.
+        tracking: as for :func:`import_demonstrations`.
+
+    Returns:
+        lowest and highest action: a number for all dimensions or a tuple with one for each.
+
+    Raises:
+        ConfigError: for invalid options, and for sources with different numbers of actions.
+        DataError: for missing or damaged files, and for discrete actions.
+    """
+    reading = vars(options or ReadOptions())
+    with open_sources(_expand(source), task=task, tracking=tracking, **reading) as sources:
+        _check_actions(sources)
+        return _bounds_of(sources)
+
+
+def read_original_bounds(path: str | Path) -> Bounds | None:
+    """The bounds that the actions of an imported file had before they were scaled to [-1, 1].
+
+    Returns:
+        lowest and highest action; ``None`` if the file was not imported.
+
+    Raises:
+        DataError: if the file is missing or damaged, or states them in another form.
+    """
+    return _parse(path, robomimic.read_metadata(path).get(ORIGINAL_BOUNDS))
+
+
+def _parse(path: str | Path, text: object) -> Bounds | None:
+    if text is None:
+        return None
+    try:
+        stated = json.loads(str(text))
+        return check_bounds((stated["low"], stated["high"]), ORIGINAL_BOUNDS)
+    except (ValueError, KeyError, TypeError) as error:  # ConfigError is a ValueError
+        message = f"attribute {ORIGINAL_BOUNDS} is {text!r}; valid: JSON with low and high"
+        raise DataError(path, "data", message) from error
+
+
+def _expand(source: Paths) -> Sequence[str | os.PathLike[str]]:
+    """The paths of a source; those of its HDF5 files for a folder that is not a data set."""
+    paths: list[str | os.PathLike[str]] = []
+    for given in [source] if isinstance(source, str | os.PathLike) else source:
+        path = Path(given).expanduser()
+        files = sorted(file for file in path.glob("*") if file.suffix in (".hdf5", ".h5"))
+        paths += files if path.is_dir() and files else [path]
+    return paths
+
+
+def _check_actions(sources: Sequence[Source]) -> None:
+    """Refuses actions that are not vectors of floating-point numbers."""
+    for source in sources:
+        # The first episode is enough: the others are compared with it when they are copied.
+        for name in list(source.episodes)[:1]:
+            actions = source.episodes[name].actions
+            if actions.dtype.kind == "f" and actions.ndim == 2:
+                continue
+            message = f"{actions.dtype} of shape {actions.shape}; valid: floating-point numbers of "
+            message += "shape (T, action_dim), since stage 1 needs continuous actions"
+            raise DataError(source.path, f"{source.prefix}{name}/actions", message)
+
+
+def _bounds_of(sources: Sequence[Source]) -> Bounds:
+    return join_bounds([_bounds_of_one(source) for source in sources])
+
+
+def _bounds_of_one(source: Source) -> Bounds:
+    if source.bounds_stated:
+        return source.bounds
+    found = range_of_actions(source.episodes, source.episodes)
+    within = np.min(found[0]) >= -1 and np.max(found[1]) <= 1
+    return (-1.0, 1.0) if within else found
+
+
+def _scaled(episode: Episode, bounds: Bounds) -> Episode:
+    """The episode with actions in [-1, 1]."""
+    if bounds == (-1.0, 1.0):
+        return episode
+    low, high = (np.asarray(bound, dtype=np.float64) for bound in bounds)
+    actions = np.clip(2 * (episode.actions - low) / (high - low) - 1, -1, 1)
+    return replace(episode, actions=actions.astype(episode.actions.dtype))
+
+
+def _original_bounds(stream: Stream, bounds: Bounds) -> Bounds:
+    """The bounds in the units of the first file, if the source was scaled before."""
+    stated = stream.attributes_of_file.get(ORIGINAL_BOUNDS)
+    before = _parse(stream.sources[0].path, stated)
+    if before is None:
+        return bounds
+    low, high = (np.asarray(bound) for bound in before)
+    return check_bounds(tuple(low + (np.asarray(bound) + 1) / 2 * (high - low) for bound in bounds))
+
+
+def _masks(stream: Stream, valid_share: float) -> tuple[dict[str, Sequence[int]], str]:
+    """Positions of the episodes of each mask, and how they were chosen."""
+    masks = dict(stream.metadata["masks"])
+    stated = all(set(MASKS) <= set(source.metadata.get("masks", {})) for source in stream.sources)
+    if stated and masks["train"] and masks["valid"]:
+        return masks, "by the masks of the source"
+    count = len(stream.names)
+    held_out = min(count - 1, max(1, round(valid_share * count)))
+    step = count // held_out
+    valid = range(step - 1, count, step)[:held_out]
+    train = [i for i in range(count) if i not in valid]
+    return masks | {"train": train, "valid": valid}, f"one in every {step}"
