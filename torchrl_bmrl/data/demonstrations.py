@@ -72,7 +72,7 @@ def read_demonstrations(
     try:
         transform = make_observation_transform(task, parts=observation_parts(task, data))
         transform(data[:1].exclude("next"))
-    except (KeyError, RuntimeError, TypeError) as error:
+    except Exception as error:  # CatTensors raises Exception itself
         raise DataError(
             path, "obs", f"does not make an observation of task {task.name} ({error})"
         ) from error

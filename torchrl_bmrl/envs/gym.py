@@ -58,6 +58,28 @@ def make_gym_env(
     return TransformedEnv(made, ActionScaling())
 
 
+def action_bounds(
+    env: str, env_options: Mapping[str, Any] | None = None
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Lowest and highest action of a gymnasium environment.
+
+    Args:
+        env: as in :func:`make_gym_env`.
+        env_options: as in :func:`make_gym_env`.
+
+    Raises:
+        ConfigError: as in :func:`make_gym_env`.
+
+    Example:
+        >>> action_bounds("Pendulum-v1")
+        ((-2.0,), (2.0,))
+    """
+    made = make_gym_env(env=env, env_options=env_options)
+    space = made.base_env.action_spec.space
+    made.close()
+    return tuple(space.low.tolist()), tuple(space.high.tolist())
+
+
 def _make_one(env: str, env_options: dict[str, Any], success: str | None) -> EnvBase:
     one = GymEnv(env, **env_options)
     if success is None:

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import (
     CatTensors,
     Compose,
@@ -279,6 +279,7 @@ def make_observation_transform(
     statistics: ObservationStatistics | None = None,
     *,
     parts: Sequence[str] | None = None,
+    cast: bool = True,
 ) -> Compose:
     """Transform from the named parts to ``observation (n,)`` float32, normalised if asked to.
 
@@ -289,6 +290,7 @@ def make_observation_transform(
         statistics: of the normalisation; ``None`` leaves the observation as it is.
         parts: names to concatenate, for a task without transforms of its own; by default those of
             the statistics or of the task.
+        cast: whether to cast float64; TorchRL refuses to cast an environment's float32.
 
     Example:
         >>> from tensordict import TensorDict
@@ -305,7 +307,8 @@ def make_observation_transform(
         if task.observation is None
         else task.observation()
     )
-    transforms.append(DoubleToFloat(in_keys=["observation"]))
+    if cast:
+        transforms.append(DoubleToFloat(in_keys=["observation"]))
     if statistics is not None:
         transforms.append(
             ObservationNorm(
@@ -370,5 +373,34 @@ def make_env(
     if num_envs is not None and num_envs < 1:
         raise BMRLError(f"num_envs is {num_envs}; valid: at least 1")
     env = task.make_env(num_envs=num_envs, **{**task.options, **options})
-    observation = make_observation_transform(task, statistics)
+    parts = None
+    if statistics is not None and statistics.parts and len(statistics.parts) == 1:
+        # A single part may have another name in the demonstrations.
+        parts = (
+            statistics.parts if statistics.parts[0] in env.observation_keys else ("observation",)
+        )
+    cast = any(env.observation_spec[key].dtype == torch.float64 for key in env.observation_keys)
+    observation = make_observation_transform(task, statistics, parts=parts, cast=cast)
+    if statistics is not None:
+        _check_observation(task, env, statistics, observation)
     return TransformedEnv(env, Compose(observation, RewardSum(), *transforms))
+
+
+def _check_observation(
+    task: Task, env: EnvBase, statistics: ObservationStatistics, transform: Compose
+) -> None:
+    """Refuses an environment whose observation is not that of the demonstrations."""
+    spec = env.observation_spec
+    try:
+        size = transform(spec.zero())["observation"].shape[-1]
+    except Exception as error:  # CatTensors raises Exception itself
+        found = ", ".join(f"{key} {tuple(spec[key].shape)}" for key in env.observation_keys)
+        raise ConfigError(
+            f"the environment of task {task.name} has {found}; valid: {len(statistics.loc)} "
+            f"numbers, from {statistics.parts or 'the parts of the task'} ({error})"
+        ) from error
+    if size != len(statistics.loc):
+        raise ConfigError(
+            f"the environment of task {task.name} has {size} observed numbers; valid: "
+            f"{len(statistics.loc)}, as its demonstrations"
+        )

@@ -1,0 +1,87 @@
+"""Demonstrations of every task: recorded with scripted experts, or imported from files."""
+
+from __future__ import annotations
+
+from torchrl_bmrl.data.demonstrations import demonstration_path, write_statistics
+from torchrl_bmrl.data.importing import find_action_bounds, import_demonstrations
+from torchrl_bmrl.data.options import Bounds, ReadOptions
+from torchrl_bmrl.data.sources import join_bounds
+from torchrl_bmrl.envs.gym import action_bounds
+from torchrl_bmrl.envs.transforms import make_env
+from torchrl_bmrl.experts.collect import collect_demonstrations
+from torchrl_bmrl.pipeline.run import Run
+from torchrl_bmrl.run.progress import progress
+from torchrl_bmrl.tasks import Task
+
+
+def collect(run: Run) -> None:
+    """Writes ``data/<task>.hdf5`` for every task, and ``data/statistics.json``.
+
+    Tasks with a scripted expert are recorded. The files of the others are imported: actions are
+    scaled to [-1, 1] from the bounds of the environment, or from bounds that all files share, and
+    some episodes are held out. What is there already is kept.
+
+    Args:
+        run: an open run.
+
+    Raises:
+        BMRLError: for demonstrations that cannot be recorded or trained on.
+    """
+    run.check_open()
+    settings = run.settings.collect
+    recorded = [task for task in run.tasks if task.record is not None]
+    if recorded:
+        collect_demonstrations(
+            run.data_dir,
+            recorded,
+            settings.train_episodes,
+            valid_episodes=settings.valid_episodes,
+            noise=settings.noise,
+            gains=settings.gains,
+            seed=run.settings.seed,
+            workers=run.settings.workers,
+            after=settings.after,
+        )
+    _import_files(run)
+    statistics = write_statistics(run.data_dir, run.tasks)
+    for task in run.tasks:
+        if task.files is not None and task.make_env is not None:
+            make_env(task, statistics).close()  # a wrong environment is refused before training
+
+
+def _import_files(run: Run) -> None:
+    tasks = [task for task in run.tasks if task.files is not None]
+    missing = [task for task in tasks if not demonstration_path(run.data_dir, task).exists()]
+    if not missing:
+        return
+    without_env = [task for task in tasks if "env" not in task.options]
+    shared = join_bounds([_bounds_of_files(task) for task in without_env]) if without_env else None
+    with progress(len(missing), "importing demonstrations", "file") as bar:
+        for task in missing:
+            assert task.files is not None
+            import_demonstrations(
+                task.files.path,
+                demonstration_path(run.data_dir, task),
+                options=_options(task),
+                valid_share=task.files.valid_share,
+                bounds=_bounds_of_env(task) or shared,
+            )
+            bar.update(1)
+
+
+def _bounds_of_env(task: Task) -> Bounds | None:
+    """Bounds of a gymnasium environment's actions; ``None`` for a task without one."""
+    if "env" not in task.options:
+        return None
+    return action_bounds(task.options["env"], task.options.get("env_options"))
+
+
+def _options(task: Task) -> ReadOptions:
+    assert task.files is not None
+    parts = {} if task.parts is None else {"observation_keys": task.parts}
+    return ReadOptions.from_mapping({**task.files.read, **parts})
+
+
+def _bounds_of_files(task: Task) -> Bounds:
+    assert task.files is not None
+    return find_action_bounds(task.files.path, options=_options(task))

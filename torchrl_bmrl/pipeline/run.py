@@ -1,0 +1,287 @@
+"""A run of the two stages: its settings, its tasks and the files in its folder."""
+
+from __future__ import annotations
+
+import gc
+import logging
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import asdict, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import TransformedEnv
+from torchrl.envs.transforms import Transform
+
+from torchrl_bmrl.data.demonstrations import (
+    demonstration_path,
+    load_transitions,
+    read_statistics,
+)
+from torchrl_bmrl.envs.transforms import ObservationStatistics, make_env
+from torchrl_bmrl.errors import BMRLError, ConfigError
+from torchrl_bmrl.evaluation.rollout import EpisodeOutcome, evaluate_policy
+from torchrl_bmrl.objectives import BCQLoss
+from torchrl_bmrl.pipeline.agents import Student, load_bcq_loss, load_student
+from torchrl_bmrl.pipeline.settings import Settings
+from torchrl_bmrl.pipeline.task_files import make_tasks, read_task_file
+from torchrl_bmrl.run.locks import hold_run
+from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
+from torchrl_bmrl.tasks import Task
+
+log = logging.getLogger(__name__)
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+
+class Run:
+    """A run folder as an object; ``with run:`` creates or opens it and locks it.
+
+    Workers receive a copy by pickle. Everything that it returns is read from the folder.
+
+    Args:
+        settings: of the run. A YAML file of tasks is read and stored in the folder's settings.
+
+    Attributes:
+        settings: the settings, with tasks and numbers of episodes written out.
+        folder: the run folder.
+        tasks: the tasks; a task's class index is its position.
+
+    Raises:
+        BMRLError: for settings that are not valid.
+
+    Example:
+        >>> import tempfile
+        >>> run = Run(Settings(run_dir=tempfile.mkdtemp(), tasks=["reach", "lift"]))
+        >>> run.settings.collect.train_episodes
+        {'reach': 60, 'lift': 80}
+        >>> with run:
+        ...     run.seed("collect", "lift", 3) == run.seed("collect", "lift", 4)
+        False
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        tasks = settings.tasks
+        if isinstance(tasks, str):
+            tasks = read_task_file(tasks)
+        made = make_tasks(tasks)
+        self.tasks = tuple(_with_run_options(task, settings, made) for task in made)
+        self.folder = Path(settings.run_dir)
+        episodes = _train_episodes(settings, self.tasks)
+        collect = replace(settings.collect, train_episodes=episodes)
+        self.settings = replace(settings, tasks=tasks, collect=collect)
+        if (only := settings.only) is not None:
+            unknown = [name for name in only if name not in self.names]
+            if not only or unknown or len(set(only)) < len(only):
+                raise ConfigError(f"only is {only}; valid: some of {list(self.names)}, each once")
+        self._opened = ExitStack()
+        self._is_open = False
+
+    def __enter__(self) -> Run:
+        # Jobs that train only some tasks leave the other tasks and everything else to other jobs.
+        parts = self.settings.only or ["run", *self.names]
+        self._opened.enter_context(hold_run(self.folder, asdict(self.settings), parts))
+        self._is_open = True
+        gc.freeze()  # imported modules stay; robosuite would search them at every env.close()
+        return self
+
+    def __exit__(self, *error: Any) -> bool | None:
+        self._is_open = False
+        return self._opened.__exit__(*error)
+
+    def __getstate__(self) -> dict[str, Any]:
+        kept = ("settings", "folder", "tasks")
+        return {name: self.__dict__[name] for name in kept}
+
+    # -- tasks ---------------------------------------------------------------------------------
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the tasks."""
+        return tuple(task.name for task in self.tasks)
+
+    @property
+    def titles(self) -> dict[str, str]:
+        """Titles of the tasks by name, for tables and figures."""
+        return {task.name: task.title for task in self.tasks}
+
+    @property
+    def playable(self) -> bool:
+        """Whether every task has an environment."""
+        return all(task.make_env is not None for task in self.tasks)
+
+    def task(self, name: str) -> Task:
+        """The task of a name."""
+        return self.tasks[self.names.index(name)]
+
+    # -- files ---------------------------------------------------------------------------------
+
+    @property
+    def data_dir(self) -> Path:
+        """Folder of the demonstrations, ``<task>.hdf5``, and their statistics."""
+        return self.folder / "data"
+
+    @property
+    def student_path(self) -> Path:
+        """The distilled policy: this run's checkpoint, or the exported file of the settings."""
+        if self.settings.evaluate.policy:
+            return Path(self.settings.evaluate.policy)
+        return self.folder / "distill" / "checkpoint.safetensors"
+
+    def demonstrations(self, name: str) -> Path:
+        """The file with a task's demonstrations."""
+        return demonstration_path(self.data_dir, self.task(name))
+
+    def agent_path(self, name: str) -> Path:
+        """Checkpoint of a stage-1 agent; the first agent of a task has the task's name."""
+        return self.folder / "bcq" / name / "checkpoint.safetensors"
+
+    @cached_property
+    def statistics(self) -> ObservationStatistics:
+        """Mean and scale of the observation over all tasks' training demonstrations."""
+        return read_statistics(self.data_dir)
+
+    def transitions(self, name: str, split: str) -> TensorDictBase:
+        """A task's normalised transitions, ``[N]``.
+
+        Args:
+            name: of the task.
+            split: ``"train"`` or ``"valid"``.
+        """
+        index = self.names.index(name)
+        return load_transitions(
+            self.data_dir, self.tasks[index], self.statistics, split=split, index=index
+        )
+
+    def teacher(self, name: str) -> BCQLoss:
+        """The trained agent of a task, frozen."""
+        return load_bcq_loss(self.agent_path(name))[0]
+
+    def student(self) -> tuple[Student, dict[str, Any]]:
+        """The distilled student and its checkpoint's metadata."""
+        return load_student(self.student_path)
+
+    def once(
+        self, file: str, read: Callable[[Path], Result], make: Callable[[Path], Any]
+    ) -> Result:
+        """The content of a file that is made once and read back afterwards.
+
+        Args:
+            file: path below the run folder.
+            read: reads the file.
+            make: writes the file, as a whole or not at all.
+        """
+        path = self.folder / file
+        if path.exists():
+            log.debug("%s: read back", path)
+        else:
+            make(path)
+        return read(path)
+
+    # -- work ----------------------------------------------------------------------------------
+
+    def check_open(self) -> None:
+        """Checks that this process holds the folder.
+
+        Raises:
+            BMRLError: if the run is not open.
+        """
+        if not self._is_open:
+            raise BMRLError(f"{self.folder} is not open; valid: with Run(settings) as run: ...")
+
+    def seed(self, *names: str | int) -> int:
+        """A seed for one purpose, derived from the run's seed."""
+        return derive_seed(self.settings.seed, *names)
+
+    def jobs(
+        self,
+        function: Callable[[tuple[Run, Job], Report], Result],
+        jobs: Iterable[Job],
+        *,
+        total: int,
+        description: str,
+        unit: str,
+        workers: int | None = None,
+    ) -> list[Result]:
+        """Calls ``function((run, job), report)`` for every job, over the run's workers.
+
+        Args:
+            function: importable by name.
+            jobs: the jobs.
+            total: units over all jobs, for the progress bar.
+            description: of the work.
+            unit: what is counted, in the singular.
+            workers: number of processes; by default the settings'.
+
+        Raises:
+            BMRLError: if the run is not open, and as
+                :func:`~torchrl_bmrl.run.workers.run_jobs`.
+        """
+        self.check_open()
+        return run_jobs(
+            function,
+            [(self, job) for job in jobs],
+            workers=workers or self.settings.workers,
+            total=total,
+            description=description,
+            unit=unit,
+        )
+
+    def make_env(self, name: str, *transforms: Transform, num_envs: int) -> TransformedEnv:
+        """A task's environment with this run's normalisation, see :func:`~envs.make_env`."""
+        return make_env(self.task(name), self.statistics, *transforms, num_envs=num_envs)
+
+    def play(
+        self,
+        task: Task,
+        policy: TensorDictModuleBase,
+        *transforms: Transform,
+        seeds: Sequence[int],
+        statistics: ObservationStatistics | None = None,
+        report: Report = lambda steps: None,
+    ) -> list[EpisodeOutcome]:
+        """Plays one episode per seed, all side by side.
+
+        Args:
+            task: of this run, or one of its compositions.
+            policy: writes ``action``.
+            *transforms: appended to the environment, such as a source of ``task_latent``.
+            seeds: of the episodes.
+            statistics: of the policy's observation; by default this run's.
+            report: called with the number of steps done.
+        """
+        statistics = statistics or self.statistics
+        with closing(make_env(task, statistics, *transforms, num_envs=len(seeds))) as env:
+            return evaluate_policy(env, policy, seeds, max_steps=self.horizon(task), report=report)
+
+    def horizon(self, task: Task) -> int:
+        """Steps after which an episode is cut off: the task's, or its longest demonstration."""
+        if task.horizon is not None:
+            return task.horizon
+        return int(self.transitions(task.name, "train")["step"].max()) + 1
+
+
+def _with_run_options(task: Task, settings: Settings, tasks: Sequence[Task]) -> Task:
+    """The task with the run's robot and stepper, if it has these options."""
+    if settings.robot and not any("robot" in each.options for each in tasks):
+        raise ConfigError(f"robot is {settings.robot}; valid for tasks without robosuite: null")
+    chosen = {"stepper": settings.stepper, "robot": settings.robot}
+    known = {key: x for key, x in chosen.items() if x is not None and key in task.options}
+    return task.with_options(**known)
+
+
+def _train_episodes(settings: Settings, tasks: Sequence[Task]) -> dict[str, int]:
+    """Number of episodes to record for each task."""
+    given = settings.collect.train_episodes
+    recorded = [task.name for task in tasks if task.record is not None]
+    for name in recorded:
+        if name not in given and "default" not in given:
+            raise ConfigError(
+                f"collect.train_episodes has {', '.join(given) or 'nothing'}; valid: a number "
+                f"for {name}, or for default"
+            )
+    return {name: given.get(name, given.get("default", 0)) for name in recorded}

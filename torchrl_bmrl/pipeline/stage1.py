@@ -1,0 +1,159 @@
+"""Stage 1: one Batch-Constrained Q-learning agent per task, from demonstrations alone."""
+
+from __future__ import annotations
+
+import logging
+from contextlib import ExitStack
+from statistics import fmean
+
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import ReplayBuffer
+
+from torchrl_bmrl.data import make_multi_task_replay_buffer, make_replay_buffer
+from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.files import write_rows
+from torchrl_bmrl.modules import BCQPolicy
+from torchrl_bmrl.objectives import BCQLoss
+from torchrl_bmrl.pipeline.learners import Agents, choose_updates
+from torchrl_bmrl.pipeline.run import Run
+from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
+from torchrl_bmrl.run.workers import Report
+from torchrl_bmrl.training.fit import Every, fit
+from torchrl_bmrl.training.update import keep_freed_memory
+
+log = logging.getLogger(__name__)
+
+
+def stage1(run: Run) -> None:
+    """Trains the agents of every task, or of the tasks in ``only``.
+
+    Each agent is trained in a process of its own, or all are stacked in this one.
+
+    Args:
+        run: an open run, with demonstrations.
+
+    Raises:
+        BMRLError: naming the agents that diverged, after the others are trained.
+    """
+    bcq = run.settings.bcq
+    agents = {
+        task if seed == 0 else f"{task}-{seed}": task
+        for seed in range(bcq.seeds)
+        for task in run.settings.only or run.names
+    }
+    stacked = bcq.stacked and len(agents) > 1
+    run.jobs(
+        train_job,
+        [agents] if stacked else [{name: task} for name, task in agents.items()],
+        total=bcq.epochs * bcq.updates_per_epoch * len(agents),
+        description="stage 1: training BCQ",
+        unit="update",
+    )
+
+
+def train_job(job: tuple[Run, dict[str, str]], report: Report) -> None:
+    """Trains agents on their tasks' demonstrations, or resumes from their checkpoint.
+
+    Args:
+        job: the run, and the task of each agent by the agent's name.
+        report: called with the number of updates done since its last call.
+    """
+    run, agents = job
+    datasets = [run.transitions(task, "train") for task in agents.values()]
+    options = {"batch_size": run.settings.bcq.batch_size, "device": run.settings.device}
+    if len(agents) == 1:
+        buffer = make_replay_buffer(datasets[0], **options)
+    else:
+        buffer = make_multi_task_replay_buffer(datasets, **options)
+    train_agents(run, agents, buffer, report, sizes=sizes_of(datasets[0]))
+
+
+def sizes_of(data: TensorDictBase) -> dict[str, int]:
+    """Sizes of the observation and the action, by the names of the networks' options."""
+    return {f"{key}_dim": data[key].shape[-1] for key in ("observation", "action")}
+
+
+def train_agents(
+    run: Run, agents: dict[str, str], buffer: ReplayBuffer, report: Report, *, sizes: dict[str, int]
+) -> None:
+    """Trains agents on samples of a buffer.
+
+    Args:
+        run: the run.
+        agents: the task of each agent by the agent's name.
+        buffer: samples are ``[batch]`` for one agent and ``[agents, batch]`` for more.
+        report: called with the number of updates done since its last call.
+        sizes: ``observation_dim`` and ``action_dim``.
+
+    Raises:
+        BMRLError: naming the agents that diverged, after the others are trained.
+    """
+    keep_freed_memory()
+    settings, bcq = run.settings, run.settings.bcq
+    trained = Agents(run, agents, sizes)
+    trained.load()
+    if trained.updates:
+        log.debug("bcq %s: resumed from update %d", ", ".join(agents), trained.updates)
+        report(trained.updates * len(agents))
+    total = bcq.epochs * bcq.updates_per_epoch
+    if trained.updates < total:
+        choose = choose_updates(run, trained.loss, trained.optimizers, trained.targets)
+        with ExitStack() as stack:
+            loggers = {}
+            for name in agents:
+                logger = make_logger(settings.logger, run.folder, f"bcq_{name}", trained.updates)
+                loggers[name] = logger
+                stack.callback(close_logger, logger)
+
+            def check(
+                update: int, metrics: dict[str, Tensor], batch: TensorDictBase, logging: bool
+            ) -> None:
+                for name, row in trained.check(metrics, batch, update).items():
+                    log_metrics(loggers[name] if logging else None, row, update)
+
+            fit(
+                lambda update, batch: choose(update)(batch),
+                lambda: buffer.sample().select(*trained.loss.in_keys),
+                start=trained.updates,
+                total=total,
+                every=Every(
+                    log=settings.log_interval,
+                    save=settings.checkpoint_interval,
+                    evaluate=bcq.updates_per_epoch if run.playable else None,
+                ),
+                check=check,
+                evaluate=lambda update: _evaluate_epoch(run, trained, update),
+                save=trained.save,
+                report=lambda updates: report(updates * len(agents)),
+            )
+    if trained.diverged:
+        raise BMRLError("; ".join(trained.diverged.values()))
+
+
+def _evaluate_epoch(run: Run, trained: Agents, update: int) -> None:
+    """Plays every agent that is well after an epoch, for the curves."""
+    epoch = update // run.settings.bcq.updates_per_epoch
+    for name in trained.well:
+        rows = trained.evaluations[name]
+        rows += _play(run, trained.agents[name], trained.agent(name), epoch, update)
+        write_rows(run.agent_path(name).with_name("evaluations.csv"), rows)
+        trained.save_best(name, update)
+        mean = fmean(row["return"] for row in rows if row["epoch"] == epoch)
+        log.debug("bcq %s: mean return %.1f after epoch %d", name, mean, epoch)
+
+
+def _play(run: Run, task: str, loss: BCQLoss, epoch: int, update: int) -> list[dict]:
+    """Episodes of an agent; the starts are the same after every epoch."""
+    seeds = [run.seed("curve", task, i) for i in range(run.settings.bcq.eval_episodes)]
+    policy = BCQPolicy.frozen(loss, num_candidates=run.settings.evaluate.num_candidates).to("cpu")
+    return [
+        {
+            "epoch": epoch,
+            "update": update,
+            "episode": i,
+            "return": outcome.episode_return,
+            "success": "" if outcome.success is None else int(outcome.success),
+        }
+        for i, outcome in enumerate(run.play(run.task(task), policy, seeds=seeds))
+    ]

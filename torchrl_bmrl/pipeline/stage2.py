@@ -1,0 +1,206 @@
+"""Stage 2: distils the agents of all tasks into one policy, conditioned on a learned embedding."""
+
+from __future__ import annotations
+
+import logging
+import math
+from contextlib import ExitStack
+from copy import deepcopy
+from dataclasses import fields
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_bmrl.data import make_multi_task_replay_buffer, with_previous
+from torchrl_bmrl.functional import nonzero_scale, sample_action_latent
+from torchrl_bmrl.modules import BCQPolicy
+from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
+from torchrl_bmrl.pipeline.agents import Student, make_distillation_loss
+from torchrl_bmrl.pipeline.run import Run
+from torchrl_bmrl.pipeline.settings import DistillSettings
+from torchrl_bmrl.pipeline.stage1 import sizes_of
+from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
+from torchrl_bmrl.run.workers import Report
+from torchrl_bmrl.training.checkpoint import keep_training, resume_training
+from torchrl_bmrl.training.fit import Every, fit
+from torchrl_bmrl.training.health import check_metrics, check_proposals
+from torchrl_bmrl.training.update import accelerate, gradient_step, keep_freed_memory, make_adam
+
+log = logging.getLogger(__name__)
+
+OF_THE_STUDENT = ("task_encoder", "task_latent_dim", "num_cells")
+OF_THE_TRAINING = ("updates", "batch_size", "lr", "cosine", "normalise_qvalue", "prototype")
+
+
+def stage2(run: Run) -> None:
+    """Trains the student of the run's agents, or resumes from its checkpoint.
+
+    Args:
+        run: an open run, with the agents of every task.
+
+    Raises:
+        BMRLError: if an agent is missing, or the training diverges.
+    """
+    run.jobs(
+        train_student,
+        [None],
+        workers=1,
+        total=run.settings.distill.updates,
+        description="stage 2: distilling",
+        unit="update",
+    )
+
+
+def value_statistics(
+    teachers: list[BCQPolicy], datasets: list[TensorDictBase]
+) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of each teacher's value on its own data, ``(num_tasks,)``."""
+    values = [
+        teacher.qvalue_network(data.select("observation", "action")).get("state_action_value")
+        for teacher, data in zip(teachers, datasets, strict=True)
+    ]
+    return torch.stack([v.mean() for v in values]), torch.stack([spread(v) for v in values])
+
+
+def spread(values: Tensor) -> Tensor:
+    """Standard deviation of a task's numbers ``(N, 1)``; 1 if they are all the same."""
+    deviation = values.std() if len(values) > 1 else torch.zeros_like(values).sum()
+    return nonzero_scale(deviation, values.abs().max(), values.dtype)
+
+
+def loss_options(settings: DistillSettings) -> dict[str, Any]:
+    """The settings that are options of the distillation loss."""
+    others = OF_THE_STUDENT + OF_THE_TRAINING
+    names = [field.name for field in fields(settings) if field.name not in others]
+    return {name: getattr(settings, name) for name in names}
+
+
+def train_student(job: tuple[Run, None], report: Report) -> None:
+    """Trains the student, or resumes from its checkpoint.
+
+    Args:
+        job: the run.
+        report: called with the number of updates done since its last call.
+    """
+    run, _ = job
+    keep_freed_memory()
+    settings, distill = run.settings, run.settings.distill
+    train, valid = (
+        [run.transitions(name, split) for name in run.names] for split in ("train", "valid")
+    )
+    if distill.context == "previous":
+        train = [with_previous(data, TRANSITION_KEYS) for data in train]
+    buffer = make_multi_task_replay_buffer(
+        train, batch_size=distill.batch_size, device=settings.device
+    )
+
+    torch.manual_seed(run.seed("distill"))
+    losses = [run.teacher(name) for name in run.names]
+    teachers = [BCQPolicy.frozen(loss) for loss in losses]
+    options = {
+        "num_tasks": len(run.names),
+        **{name: getattr(distill, name) for name in OF_THE_STUDENT},
+        "latent_dim": teachers[0].latent_dim,
+        **sizes_of(train[0]),
+    }
+    student = Student(**options)
+    normalisation = value_statistics(teachers, train) if distill.normalise_qvalue else (None, None)
+    loss = make_distillation_loss(
+        student,
+        teachers,
+        qvalue_loc=normalisation[0],
+        qvalue_scale=normalisation[1],
+        reward_scale=torch.stack([spread(data["next", "reward"]) for data in train]),
+        **loss_options(distill),
+    ).to(settings.device)
+    optimizer = make_adam(loss.parameters(), lr=distill.lr)
+    path = run.folder / "distill" / "checkpoint.safetensors"
+    kept = resume_training(
+        path, student, {"student": optimizer}, kind="student", device=settings.device
+    )
+    done = kept["updates"] if kept else 0
+    if done:
+        log.debug("distillation: resumed from update %d", done)
+        report(done)
+    if done == distill.updates:
+        return
+
+    def update(batch: TensorDictBase) -> dict[str, Tensor]:
+        losses = loss(batch)
+        total = sum(term for name, term in losses.items() if name.startswith("loss_"))
+        gradient_step(optimizer, total)
+        return {name: value.detach() for name, value in losses.items()}
+
+    update = accelerate(
+        update,
+        compiled=settings.compile,
+        captured=settings.cudagraphs,
+        device=settings.device,
+    )
+
+    def step(number: int, batch: TensorDictBase) -> dict[str, Tensor]:
+        if distill.cosine:  # from lr to zero
+            share = (number - 1) / distill.updates
+            rate = distill.lr * (1 + math.cos(math.pi * share)) / 2
+            optimizer.param_groups[0]["lr"].fill_(rate)
+        return update(batch.select(*loss.in_keys))
+
+    def check(
+        number: int, metrics: dict[str, Tensor], batch: TensorDictBase, logging: bool
+    ) -> None:
+        where = f"distillation, update {number}"
+        check_metrics(metrics, where)
+        some = batch[:, :32]
+        proposed = proposals(student, some, teachers[0].latent_clip, settings.device)
+        check_proposals(proposed, some["action"], where)
+        log_metrics(logger if logging else None, metrics, number)
+
+    def save(number: int) -> None:
+        own = student if settings.device == "cpu" else deepcopy(student).to("cpu")
+        own.set_prototypes(train, distill.prototype)
+        metadata = {
+            "kind": "student",
+            "tasks": list(run.names),
+            "student": options,
+            "latent_clip": teachers[0].latent_clip,
+            "updates": number,
+            "accuracy": own.accuracy(torch.cat(valid)),
+            "settings": settings.deciding(),
+            "statistics": run.statistics.to_lists(),
+        }
+        keeping = {"device": settings.device, "keep": settings.keep_checkpoints}
+        keep_training(path, own, {"student": optimizer}, metadata, **keeping)
+        accuracy = metadata["accuracy"]
+        log.debug("distillation: update %d saved, accuracy %.1f%%", number, 100 * accuracy)
+
+    with ExitStack() as stack:
+        logger = make_logger(settings.logger, run.folder, "distill", done)
+        stack.callback(close_logger, logger)
+        fit(
+            step,
+            buffer.sample,
+            start=done,
+            total=distill.updates,
+            every=Every(log=settings.log_interval, save=settings.checkpoint_interval),
+            check=check,
+            save=save,
+            report=report,
+        )
+
+
+@torch.no_grad()
+def proposals(
+    student: Student, batch: TensorDictBase, latent_clip: float | None, device: str
+) -> Tensor:
+    """Candidates of the student, ``(num_tasks, B, candidates, action_dim)``."""
+    data = batch.select("observation").set("task_latent", student.embed(batch))
+    data = data.unsqueeze(-1).expand(*data.batch_size, 10)
+    on_gpu = torch.device(device).type == "cuda"
+    # Training draws the same random numbers with and without this check.
+    with torch.random.fork_rng([torch.device(device)] if on_gpu else []):
+        latent = sample_action_latent(
+            (*data.batch_size, student.latent_dim), latent_clip=latent_clip, device=device
+        )
+    return student.generator(data.set("action_latent", latent))["action"]
