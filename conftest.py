@@ -49,7 +49,7 @@ _NEEDS = {
     "matplotlib": ["tests/published_data.py", "torchrl_bmrl/reports/*"],
     "minari": ["torchrl_bmrl/data/convert.py"],
     "mujoco": ["torchrl_bmrl/reports/films.py"],
-    "onnxscript": ["torchrl_bmrl/pipeline/export.py"],
+    "onnxscript": ["torchrl_bmrl/export.py"],
     "robosuite": [
         "torchrl_bmrl/envs/*",
         "torchrl_bmrl/evaluation/rollout.py",

@@ -23,6 +23,16 @@ from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.files import read_json, write_atomic
 from torchrl_bmrl.tasks import Task
 
+TRANSITION_KEYS = (
+    "observation",
+    "action",
+    "episode",
+    "step",
+    "task",
+    *(("next", key) for key in ("observation", "reward", "done", "terminated", "truncated")),
+)
+"""Keys of the transitions that training reads."""
+
 
 def demonstration_path(data_dir: Path, task: Task) -> Path:
     """The file with a task's demonstrations."""
@@ -215,13 +225,13 @@ def load_transitions(
         index: class index y of the task.
 
     Returns:
-        batch ``[N]`` with ``observation (N, n)`` in place of its parts, now and under ``"next"``,
-        and the other keys of :func:`read_demonstrations`.
+        batch ``[N]`` with ``observation (N, n)``, ``action``, ``episode``, ``step``, ``task`` and
+        under ``"next"`` ``observation``, ``reward``, ``done``, ``terminated``, ``truncated``.
 
     Raises:
         DataError: for a file that :func:`read_demonstrations` refuses.
     """
     path = demonstration_path(data_dir, task)
-    return transform_data(
-        read_demonstrations(path, task, split=split, index=index), task, statistics
-    )
+    data = read_demonstrations(path, task, split=split, index=index)
+    # The same keys for every task: other arrays may differ from file to file.
+    return transform_data(data, task, statistics).select(*TRANSITION_KEYS)

@@ -1,0 +1,263 @@
+"""Evaluation of a run: episodes from starts that no demonstration had, and the report."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs.transforms import Transform
+
+from torchrl_bmrl.data.demonstrations import read_demonstrations, read_phases
+from torchrl_bmrl.envs.transforms import ObservationStatistics
+from torchrl_bmrl.errors import ConfigError
+from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
+from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
+from torchrl_bmrl.modules import BCQPolicy
+from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
+from torchrl_bmrl.pipeline.agents import Student
+from torchrl_bmrl.pipeline.held_out import evaluate_held_out
+from torchrl_bmrl.pipeline.run import Run
+from torchrl_bmrl.reports import Embeddings, write_report
+from torchrl_bmrl.reports.films import explore_demonstrations
+from torchrl_bmrl.run.folder import read_versions
+from torchrl_bmrl.run.workers import Report
+from torchrl_bmrl.training.checkpoint import load_checkpoint
+
+log = logging.getLogger(__name__)
+
+
+def evaluate(run: Run) -> str:
+    """Evaluates every policy on every task, then writes ``results.csv`` and the report.
+
+    A run with a task that has no environment is evaluated on held-out demonstrations instead
+    (:func:`~torchrl_bmrl.pipeline.held_out.evaluate_held_out`).
+
+    Args:
+        run: an open run with both stages, or with ``evaluate.policy``, an exported policy.
+
+    Returns:
+        the table of results as Markdown, and the path of the report.
+
+    Raises:
+        BMRLError: if something is missing or damaged.
+    """
+    run.check_open()
+    settings, alone = run.settings.evaluate, run.settings.evaluate.policy is not None
+    if alone:
+        known = run.student()[1]["tasks"]
+        if not set(run.names) <= set(known):
+            raise ConfigError(f"tasks is {list(run.names)}; valid for {settings.policy}: {known}")
+    if run.playable:
+        policies = [] if alone else [("expert", ""), ("bcq", "")]
+        policies += [("distilled", source) for source in settings.latent_sources]
+        jobs = [(task, *policy) for policy in policies for task in run.names]
+        rows = run.jobs(
+            evaluate_job,
+            jobs,
+            total=sum(settings.episodes * run.horizon(run.task(task)) for task, *_ in jobs),
+            description="evaluating",
+            unit="step",
+        )
+        write_results(run.folder / "results.csv", [row for part in rows for row in part])
+        table = run.folder / "tables" / "results.md"
+    else:
+        evaluate_held_out(run)
+        table = run.folder / "tables" / "held_out.md"
+    look = not alone and run.settings.distill.task_encoder == "transition"
+    write_report(
+        run.folder,
+        default_source=settings.latent_sources[0],
+        facts=run_facts(run),
+        seed=run.settings.seed,
+        **(look_at_embedding(run) if look else {}),
+    )
+    return f"{table.read_text(encoding='utf-8')}\nreport: {run.folder / 'report.html'}"
+
+
+def keep_rows(
+    run: Run,
+    task: str,
+    policy: str,
+    play: Callable[[list[int]], list[EpisodeOutcome]],
+    *,
+    source: str = "",
+    report: Report,
+) -> list[ResultRow]:
+    """The evaluation's episodes of one task, policy and source of m, played once.
+
+    Args:
+        run: the run.
+        task: whose episodes.
+        policy: its name in tables.
+        play: plays episodes that start with the given seeds.
+        source: of m, for the distilled policy.
+        report: called with the number of steps if the episodes are read back.
+    """
+    name = "-".join(filter(None, (task, policy, source)))
+    path = run.folder / "evaluation" / f"{name}.csv"
+    episodes = run.settings.evaluate.episodes
+    if path.exists():
+        report(episodes * run.horizon(run.task(task)))
+        log.debug("%s: read back", path)
+        return read_results(path)
+    outcomes = play([run.seed("evaluate", task, i) for i in range(episodes)])
+    rows = [
+        ResultRow(
+            task=task,
+            policy=policy,
+            latent_source=source,
+            seed=run.settings.seed,
+            episode=i,
+            episode_return=outcome.episode_return,
+            success=outcome.success,
+        )
+        for i, outcome in enumerate(outcomes)
+    ]
+    write_results(path, rows)
+    log.debug("%s: mean return %.1f", path, fmean(row.episode_return for row in rows))
+    return rows
+
+
+def evaluate_job(job: tuple[Run, tuple[str, str, str]], report: Report) -> list[ResultRow]:
+    """All episodes of one task, policy and source of m."""
+    run, (name, policy_name, source) = job
+    task, count = run.task(name), run.settings.evaluate.num_candidates
+
+    def play(seeds: list[int]) -> list[EpisodeOutcome]:
+        if policy_name == "expert":
+            outcomes = expert_outcomes(run, name, seeds)
+            report(len(seeds) * run.horizon(task))
+            return outcomes
+        if policy_name == "bcq":
+            policy = BCQPolicy.frozen(run.teacher(name), num_candidates=count)
+            return run.play(task, policy, seeds=seeds, report=report)
+        student, metadata = run.student()
+        policy = student.policy(num_candidates=count, latent_clip=metadata["latent_clip"])
+        transform = source_of_m(run, name, student, metadata, source)
+        statistics = ObservationStatistics.from_lists(metadata["statistics"])
+        return run.play(task, policy, transform, seeds=seeds, statistics=statistics, report=report)
+
+    return keep_rows(run, name, policy_name, play, source=source, report=report)
+
+
+def source_of_m(
+    run: Run, name: str, student: Student, metadata: dict[str, Any], source: str
+) -> Transform:
+    """The transform that writes ``task_latent`` for a task while the distilled policy acts."""
+    demonstration = held_out_episode(run, name) if source == "demonstration" else None
+    return student.task_latent_source(source, metadata["tasks"].index(name), demonstration)
+
+
+def held_out_episode(run: Run, name: str) -> TensorDictBase:
+    """The demonstration that m may come from; an exported policy contains its own."""
+    if run.settings.evaluate.policy:
+        state, _ = load_checkpoint(run.student_path, kind="student")
+        return TensorDict(state["demonstrations"][name]).auto_batch_size_(1)
+    data = run.transitions(name, "valid")
+    return data[data["episode"] == data["episode"].min()]
+
+
+def expert_outcomes(run: Run, name: str, seeds: list[int]) -> list[EpisodeOutcome]:
+    """Episodes of the expert: fresh ones from the evaluation's starts, or its demonstrations."""
+    task, collect = run.task(name), run.settings.collect
+    if run.settings.evaluate.expert_rollouts and task.record is not None:
+        options = {"noise": collect.noise, "gains": collect.gains, **task.options}
+        episodes = (task.record(seed, **options) for seed in seeds)
+        return [
+            EpisodeOutcome(float(episode.rewards.sum()), bool(episode.extras["successes"].any()))
+            for episode in episodes
+        ]
+    data = read_demonstrations(run.demonstrations(name), task, index=run.names.index(name))
+    success = data.get(("next", "success"), None)
+    returns = data["next", "reward"].double()
+    masks = [data["episode"] == i for i in data["episode"].unique()]
+    return [
+        EpisodeOutcome(
+            float(returns[mask].sum()), None if success is None else bool(success[mask].any())
+        )
+        for mask in masks
+    ]
+
+
+def embed(run: Run, split: str) -> tuple[Embeddings, float]:
+    """Embeddings of a split of the demonstrations and the classifier's accuracy on them."""
+    student, metadata = run.student()
+    with torch.random.fork_rng([]):
+        torch.manual_seed(run.seed("untrained encoder"))
+        untrained = Student(**metadata["student"])
+    parts, distances, successes, phases, phase_names = [], [], [], [], {}
+    for index, task in enumerate(run.tasks):
+        path = run.demonstrations(task.name)
+        parts.append(run.transitions(task.name, split))
+        raw = read_demonstrations(path, task, split=split, index=index)
+        distances.append(_distance(raw))
+        successes.append(_success(raw))
+        phase, names = read_phases(path, split=split)
+        phases.append(phase.numpy())
+        phase_names |= {task.name: names} if names else {}
+    data = torch.cat(parts)
+    embeddings = Embeddings(
+        task_latent=student.embed(data).numpy(),
+        task=data["task"].numpy(),
+        tasks=run.names,
+        episode=data["episode"].numpy(),
+        step=data["step"].numpy(),
+        distance=np.concatenate(distances),
+        success=np.concatenate(successes),
+        phase=np.concatenate(phases),
+        phase_names=phase_names,
+        baselines={
+            "raw transition": torch.cat([data[key] for key in TRANSITION_KEYS], -1).numpy(),
+            "untrained encoder": untrained.embed(data).numpy(),
+        },
+    )
+    return embeddings, student.accuracy(data)
+
+
+def _distance(raw: TensorDictBase) -> np.ndarray:
+    """Distance of the end-effector to the goal [m]; nan for observations without both."""
+    if "goal_pos" not in raw or "robot0_eef_pos" not in raw:
+        return np.full(len(raw), np.nan)
+    return (raw["robot0_eef_pos"] - raw["goal_pos"]).norm(dim=-1).numpy()
+
+
+def _success(raw: TensorDictBase) -> np.ndarray:
+    success = raw.get(("next", "success"), None)
+    return np.zeros(len(raw), dtype=bool) if success is None else success.squeeze(-1).numpy()
+
+
+def look_at_embedding(run: Run) -> dict[str, Any]:
+    """The parts of the report that show the embedding."""
+    embeddings, accuracy = embed(run, "valid")
+    return {
+        "embeddings": embeddings,
+        "training": embed(run, "train")[0],
+        "accuracy": accuracy,
+        "explorer": explore_demonstrations(run.data_dir, embeddings),
+    }
+
+
+def run_facts(run: Run) -> dict[str, str]:
+    """Facts about the run for the report."""
+    settings = run.settings
+    versions = read_versions(run.folder)
+    said = {"Versions": ", ".join(f"{name} {version}" for name, version in versions.items())}
+    if settings.evaluate.policy:
+        return {"Policy": settings.evaluate.policy, "Seed of the starts": str(settings.seed)} | said
+    counts = settings.collect.train_episodes
+    recorded = ", ".join(f"{name} {count}" for name, count in counts.items())
+    sources = [f"{recorded}; {settings.collect.valid_episodes} held out of each"] if counts else []
+    sources += [f"{task.name} from {task.files.path}" for task in run.tasks if task.files]
+    ablation = f", {settings.ablation}" if settings.ablation != "none" else ""
+    return {
+        "Preset": settings.preset + ablation,
+        "Seed": str(settings.seed),
+        "Demonstrations": "; ".join(sources),
+        "Stage 1": f"{settings.bcq.epochs} epochs of {settings.bcq.updates_per_epoch} updates",
+        "Stage 2": f"{settings.distill.updates} updates",
+    } | said

@@ -1,0 +1,134 @@
+"""Evaluation without an environment: held-out losses, accuracy and fitted Q evaluation."""
+
+from __future__ import annotations
+
+import logging
+
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_bmrl.evaluation.fitted_q import estimate_return
+from torchrl_bmrl.files import finite, read_rows, write_rows
+from torchrl_bmrl.modules import BCQPolicy
+from torchrl_bmrl.pipeline.run import Run
+from torchrl_bmrl.reports.page import Section
+from torchrl_bmrl.reports.studies import write_study
+from torchrl_bmrl.reports.tables import Table
+from torchrl_bmrl.run.workers import Report
+
+log = logging.getLogger(__name__)
+
+COLUMNS = {
+    "task": str,
+    "loss_generator": finite,
+    "loss_qvalue": finite,
+    "distance": finite,
+    "accuracy": finite,
+    "demonstrated": finite,
+    "bcq": finite,
+    "distilled": finite,
+}
+_PAGE = (
+    "At least one task has no environment, so that no policy could be played. The losses are "
+    "those of held-out demonstrations. The returns are discounted: those of the demonstrations "
+    "are measured, those of the policies are estimates of fitted Q evaluation, which rank policies "
+    "rather than measure them."
+)
+
+
+def evaluate_held_out(run: Run) -> None:
+    """Judges both stages on held-out demonstrations and writes ``held_out.csv`` and a table.
+
+    Args:
+        run: an open run with both stages.
+    """
+    log.warning("some tasks have no environment: held-out losses and estimates instead of returns")
+    updates = run.settings.evaluate.fqe_updates
+    rows = run.jobs(
+        held_out_job,
+        run.names,
+        total=2 * updates * len(run.names),
+        description="evaluating on held-out demonstrations",
+        unit="update",
+    )
+    write_rows(run.folder / "held_out.csv", rows)
+    table = Table(
+        title="Held-out demonstrations",
+        caption=_PAGE,
+        header=(
+            "Task",
+            "Generator loss",
+            "Critic loss",
+            "Student to teacher",
+            "Accuracy of the task",
+            "Return, demonstrations",
+            "BCQ (estimate)",
+            "Distilled (estimate)",
+        ),
+        rows=[
+            (
+                run.titles[row["task"]],
+                *(f"{row[key]:.4g}" for key in ("loss_generator", "loss_qvalue", "distance")),
+                f"{row['accuracy']:.1%}",
+                *(f"{row[key]:.2f}" for key in ("demonstrated", "bcq", "distilled")),
+            )
+            for row in rows
+        ],
+    )
+    write_study(run.folder, "held_out", Section(heading=table.title, tables=[table]), {})
+
+
+def held_out_job(job: tuple[Run, str], report: Report) -> dict[str, str | float]:
+    """The numbers of one task; computed once."""
+    run, name = job
+    path = run.folder / "evaluation" / f"{name}-held_out.csv"
+    if path.exists():
+        report(2 * run.settings.evaluate.fqe_updates)
+        return read_rows(path, COLUMNS)[0]
+    valid, index = run.transitions(name, "valid"), run.names.index(name)
+    loss, (student, metadata) = run.teacher(name), run.student()
+    torch.manual_seed(run.seed("held out", name))
+    with torch.no_grad():
+        generator, qvalue = (f(valid.copy())[0] for f in (loss.generator_loss, loss.qvalue_loss))
+    teacher = BCQPolicy.frozen(loss, num_candidates=loss.num_candidates)
+    policy = student.policy(num_candidates=loss.num_candidates, latent_clip=metadata["latent_clip"])
+
+    def told(data: TensorDictBase) -> TensorDictBase:
+        """The data with the task's prototype as m, now and next."""
+        m = student.prototypes[index].expand(len(data), -1)
+        after = data["next"].copy().set("task_latent", m)
+        return data.copy().set("task_latent", m).set("next", after)
+
+    acts = [
+        each(data.select(*each.in_keys))["action"]
+        for each, data in ((teacher, valid), (policy, told(valid)))
+    ]
+    train, settings = run.transitions(name, "train"), run.settings
+    options = {
+        "updates": settings.evaluate.fqe_updates,
+        "gamma": settings.bcq.gamma,
+        "num_cells": settings.bcq.num_cells,
+        "device": settings.device,
+        "report": report,
+    }
+    estimates = {}
+    for key, each, data in (("bcq", teacher, train), ("distilled", policy, told(train))):
+        torch.manual_seed(run.seed("held out", name, "critic"))
+        estimates[key] = estimate_return(each, data, where=f"{key} on {name}", **options)
+    row: dict[str, str | float] = {
+        "task": name,
+        "loss_generator": generator.item(),
+        "loss_qvalue": qvalue.item(),
+        "distance": (acts[0] - acts[1]).norm(dim=-1).mean().item(),
+        "accuracy": student.accuracy(valid),
+        "demonstrated": _discounted_return(train, settings.bcq.gamma),
+        **estimates,
+    }
+    write_rows(path, [row])
+    return row
+
+
+def _discounted_return(data: TensorDictBase, gamma: float) -> float:
+    """Mean over the episodes of the discounted sum of their rewards."""
+    discounted = data["next", "reward"].squeeze(-1) * gamma ** data["step"]
+    return (discounted.sum() / len(data["episode"].unique())).item()

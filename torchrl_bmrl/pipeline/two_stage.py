@@ -1,0 +1,47 @@
+"""The whole pipeline, one stage after the other."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+
+from torchrl_bmrl.files import read_json, write_atomic
+from torchrl_bmrl.pipeline.collect import collect
+from torchrl_bmrl.pipeline.evaluate import evaluate
+from torchrl_bmrl.pipeline.run import Run
+from torchrl_bmrl.pipeline.stage1 import stage1
+from torchrl_bmrl.pipeline.stage2 import stage2
+
+log = logging.getLogger(__name__)
+
+STAGES = {"collect": collect, "stage 1": stage1, "stage 2": stage2, "evaluate": evaluate}
+
+
+def two_stage(run: Run) -> str:
+    """Collects demonstrations, trains both stages, evaluates, and writes the report.
+
+    Each stage skips what an earlier call finished.
+
+    Args:
+        run: an open run.
+
+    Returns:
+        the table of results as Markdown, the path of the report and the time of each stage.
+        ``seconds.json`` contains the times, summed over all calls.
+
+    Raises:
+        BMRLError: of a stage.
+    """
+    run.check_open()
+    path = run.folder / "seconds.json"
+    seconds = read_json(path, "the seconds of a run") if path.exists() else {}
+    for name, stage in STAGES.items():
+        started = time.monotonic()
+        result = stage(run)
+        # Summed over interruptions, up to the one that was killed.
+        seconds[name] = round(seconds.get(name, 0.0) + time.monotonic() - started, 1)
+        write_atomic(path, json.dumps(seconds, indent=2) + "\n")
+        log.debug("%s: done", name)
+    times = ", ".join(f"{name} {value / 60:.1f} min" for name, value in seconds.items())
+    return f"{result}\n{times}"
