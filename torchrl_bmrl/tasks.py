@@ -181,5 +181,7 @@ def get_task(name: str) -> Task:
     composers = {task.compose for task in tasks}
     compose = tasks[0].compose
     if len(composers) > 1 or compose is None:
-        raise ConfigError(f"task {name}: {', '.join(parts)} cannot follow each other in one episode")
+        raise ConfigError(
+            f"task {name}: {', '.join(parts)} cannot follow each other in one episode"
+        )
     return compose(tasks)

@@ -11,8 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import GymEnv, GymWrapper, TransformedEnv
-from torchrl.envs.gym_like import default_info_dict_reader
+from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import (
     CatTensors,
     Compose,
@@ -23,9 +22,8 @@ from torchrl.envs.transforms import (
 )
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.extras import needs
 from torchrl_bmrl.functional import nonzero_scale
-from torchrl_bmrl.names import composition_stages, gymnasium_id, horizon_of
+from torchrl_bmrl.names import horizon_of
 
 OBSERVATION_PARTS = (
     "sin_joint_pos",
@@ -353,28 +351,11 @@ def make_env(
         torch.Size([2, 3, 33])
     """
     # Imported here: the reading of data does not need the simulator.
-    with needs("robosuite"):
-        import gymnasium
+    from torchrl_bmrl.experts.tabletop import make_tabletop_env
 
-    from torchrl_bmrl.envs.tasks import REWARD_TERMS
-
-    name = f"torchrl_bmrl.envs:{gymnasium_id(task)}"
-    if len(composition_stages(task)) > 1:  # these share one id
-        kwargs = {"task": task, "horizon": horizon_of(task)} | kwargs
-    env = (
-        GymEnv(name, **kwargs)
-        if num_envs is None
-        else GymWrapper(gymnasium.make_vec(name, num_envs, **kwargs))
+    env = make_tabletop_env(
+        skills=task, num_envs=num_envs, **({"horizon": horizon_of(task)} | kwargs)
     )
-    shape = env.batch_size
-    keys = ["success", "stage", *(f"reward_{name}" for name in REWARD_TERMS)]
-    spec = Composite(
-        success=Unbounded(shape, dtype=torch.bool),
-        stage=Unbounded(shape, dtype=torch.int64),
-        **{key: Unbounded(shape, dtype=torch.float64) for key in keys[2:]},
-        shape=shape,
-    )
-    env.set_info_dict_reader(default_info_dict_reader(keys, spec=spec))
     return TransformedEnv(
         env, Compose(make_observation_transform(statistics), RewardSum(), *transforms)
     )
