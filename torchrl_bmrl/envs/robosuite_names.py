@@ -45,18 +45,22 @@ class BMRLSawyerComposition(TabletopScene):
 
 
 def robosuite_metadata(
-    skills: SkillLike | Sequence[SkillLike], robot: str = "Sawyer"
+    skills: SkillLike | Sequence[SkillLike], robot: str = "Sawyer", gripper: str = "default"
 ) -> dict[str, Any]:
     """robomimic's ``env_args``: how ``robosuite.make`` rebuilds the environment of demonstrations.
 
     Args:
         skills: as for :class:`TabletopScene`.
         robot: the arm.
+        gripper: as for :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`.
     """
     described = [describe_skill(skill) for skill in make_skills(skills)]
-    name, kwargs = "TabletopScene", {"skills": described}
+    name: str = "TabletopScene"
+    kwargs: dict[str, Any] = {"skills": described}
     if robot == "Sawyer" and all(isinstance(each, str) for each in described):
         name, kwargs = _sawyer_names(described)
+    if gripper != "default":
+        kwargs = kwargs | {"gripper_types": gripper}
     return {
         "env_name": name,
         "type": 1,

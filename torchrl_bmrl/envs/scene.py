@@ -73,6 +73,7 @@ class TabletopScene(ManipulationEnv):
     Args:
         skills: a skill, several in a row, or names of :data:`~torchrl_bmrl.envs.skills.SKILLS`.
         robots: the arm, one of :data:`~torchrl_bmrl.envs.arms.ARMS`.
+        gripper_types: robosuite's name of a gripper, or ``"default"`` for the arm's own.
         seed: of the starts.
         lean: whether the model is :func:`without_pictures`; robosuite's cameras need it complete.
         **kwargs: robosuite's own options.
@@ -91,6 +92,7 @@ class TabletopScene(ManipulationEnv):
         skills: SkillLike | Sequence[SkillLike],
         *,
         robots: str = "Sawyer",
+        gripper_types: str = "default",
         seed: int | None = None,
         lean: bool = False,
         **kwargs: Any,
@@ -103,6 +105,7 @@ class TabletopScene(ManipulationEnv):
         settings: dict[str, Any] = {
             "robots": check_arm(robots),
             "controller_configs": load_composite_controller_config(robot=robots),
+            "gripper_types": gripper_types,
             "initialization_noise": None,
             "use_camera_obs": False,
             "has_renderer": False,

@@ -53,8 +53,9 @@ class TabletopEnv(gymnasium.Env):
             (:func:`torchrl_bmrl.envs.rendering.graphics_library`).
         camera: robosuite camera for :meth:`render`.
         image_size: height and width of the rendered picture [pixels].
-        robot: the arm, one of :data:`torchrl_bmrl.envs.arms.ARMS`, with the gripper that robosuite
-            gives it.
+        robot: the arm, one of :data:`torchrl_bmrl.envs.arms.ARMS`.
+        gripper: robosuite's name of a gripper, or ``"default"`` for the one that robosuite gives
+            the arm.
         stepper: ``"fast"``, compiled code that computes robosuite's trajectories bit by bit, or
             ``"robosuite"``. A controller that the compiled code does not cover is advanced by
             robosuite; a warning says so once.
@@ -88,6 +89,7 @@ class TabletopEnv(gymnasium.Env):
         image_size: tuple[int, int] = (256, 256),
         *,
         robot: str = "Sawyer",
+        gripper: str = "default",
         stepper: str = "fast",
         controller_configs: dict[str, Any] | None = None,
         horizon: int | None = None,
@@ -109,7 +111,12 @@ class TabletopEnv(gymnasium.Env):
             {} if controller_configs is None else {"controller_configs": controller_configs}
         )
         self.robosuite_env = TabletopScene(
-            skills, robots=robot, use_object_obs=False, lean=stepper == "fast", **options
+            skills,
+            robots=robot,
+            gripper_types=gripper,
+            use_object_obs=False,
+            lean=stepper == "fast",
+            **options,
         )
         own = (term for skill in self.robosuite_env.skills for term in skill.terms)
         self.reward_terms = tuple(dict.fromkeys((*REWARD_TERMS, *own)))

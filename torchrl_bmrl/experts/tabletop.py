@@ -38,9 +38,9 @@ def make_task(
 ) -> Task:
     """The task of one skill, to be registered with :func:`~torchrl_bmrl.tasks.register_task`.
 
-    Its options are ``skills``, ``robot`` (one of :data:`torchrl_bmrl.envs.arms.ARMS`) and
-    ``stepper`` (:class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`). Compositions have
-    :data:`STAGE_HORIZON` steps for each skill.
+    Its options are ``skills``, ``robot``, ``gripper`` and ``stepper``, those of
+    :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`. Compositions have :data:`STAGE_HORIZON` steps
+    for each skill.
 
     Args:
         skill: start, goal, reward and success.
@@ -55,7 +55,9 @@ def make_task(
         >>> task.name, task.horizon, task.options["robot"]
         ('lift', 200, 'Panda')
     """
-    return _make_task([skill], [expert], {"robot": robot, "stepper": "fast"}, horizon)
+    return _make_task(
+        [skill], [expert], {"robot": robot, "gripper": "default", "stepper": "fast"}, horizon
+    )
 
 
 def _make_task(
@@ -204,7 +206,8 @@ def record_episode(
         gains: of the experts; ``None`` for the defaults.
         after: tasks whose experts act first. The episode begins where the last of them succeeded,
             with arm, gripper and cube as they are then. Empty: where the skill itself begins.
-        **options: ``robot`` and ``stepper`` of :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`.
+        **options: ``robot``, ``gripper`` and ``stepper`` of
+            :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`.
 
     Returns:
         the episode with the extras ``successes``, ``states`` and, for one skill, ``phases``, for a
@@ -278,7 +281,9 @@ def record_episode(
             **({"phase_names": list(expert.phases)} if alone else {}),
             "model_file": model_file,
             **({"after": "-".join(skill.name for skill in before)} if before else {}),
-            "env_args": robosuite_metadata(skills, scene.robot_names[0]),
+            "env_args": robosuite_metadata(
+                skills, options.get("robot", "Sawyer"), options.get("gripper", "default")
+            ),
         },
     )
 
