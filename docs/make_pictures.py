@@ -19,11 +19,9 @@ from PIL import Image
 from tensordict import TensorDict
 
 from torchrl_bmrl.envs.rendering import render_states
-from torchrl_bmrl.experts.collect import collect_episode
-from torchrl_bmrl.experts.controllers import ExpertGains
-from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.pipeline.agents import load_student
 from torchrl_bmrl.reports import TASK_COLORS, embedding_scatter, task_name
+from torchrl_bmrl.tasks import get_task
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 DOCS = Path(__file__).parent
@@ -81,13 +79,13 @@ def data_flow() -> bytes:
 def tasks() -> bytes:
     """An expert's episode of each task, half a second after it succeeded."""
     scenes = []
-    for task in TASKS:
-        episode = collect_episode(task, 3, noise=0.2, gains=ExpertGains())
+    for task in tasks:
+        episode = get_task(task).record(3, noise=0.2, **get_task(task).options)
         step = min(int(episode.extras["successes"].argmax()) + 10, len(episode) - 1)
         scenes.append((episode.attributes["model_file"], episode.extras["states"][step : step + 1]))
     pictures = [frames[0] for frames in render_states(scenes, size=SIZE)]
     figure = Figure(figsize=(9, 6.4), layout="constrained")
-    for axes, task, picture in zip(figure.subplots(2, 3).flat, TASKS, pictures, strict=True):
+    for axes, task, picture in zip(figure.subplots(2, 3).flat, tasks, pictures, strict=True):
         axes.imshow(picture)
         axes.set_title(task_name(task), fontsize=10)
         axes.set_axis_off()
@@ -102,7 +100,7 @@ def embedding() -> bytes:
     for task in metadata["tasks"]:
         episode = TensorDict(state["demonstrations"][task]).auto_batch_size_(1)
         points.append(student.embed(episode))
-        labels += [TASKS.index(task)] * len(points[-1])
+        labels += [tasks.index(task)] * len(points[-1])
     return embedding_scatter(torch.cat(points).numpy(), np.array(labels))
 
 

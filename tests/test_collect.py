@@ -15,14 +15,17 @@ pytest.importorskip("h5py")
 
 import h5py
 
-from torchrl_bmrl import names
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import open_episodes, read_kept_episode
 from torchrl_bmrl.data.schema import OBSERVATION_SHAPES
-from torchrl_bmrl.errors import DataError, UnknownNameError
+from torchrl_bmrl.envs.skills import SKILLS
+from torchrl_bmrl.errors import ConfigError, DataError, UnknownNameError
 from torchrl_bmrl.experts import collect
-from torchrl_bmrl.experts.collect import collect_demonstrations, collect_episode
-from torchrl_bmrl.experts.controllers import ExpertGains
+from torchrl_bmrl.experts.collect import EpisodeJob, collect_demonstrations
+from torchrl_bmrl.experts.controllers import EXPERTS
+from torchrl_bmrl.experts.tabletop import make_task
+from torchrl_bmrl.run.workers import Report
+from torchrl_bmrl.tasks import DemonstrationFiles, Task
 
 pytestmark = pytest.mark.robosuite
 
@@ -34,17 +37,15 @@ class Killed(BaseException):
     """Like a signal: no ``except Exception`` stops it."""
 
 
-@pytest.fixture(autouse=True)
-def _short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(names, "HORIZON", HORIZON)
+def short(name: str, **options: object) -> Task:
+    task = make_task(SKILLS[name], EXPERTS[type(SKILLS[name])], horizon=HORIZON)
+    return task.with_options(**options)
 
 
 @pytest.fixture(scope="module")
 def collected(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Path]]:
     """A collection by one worker."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(names, "HORIZON", HORIZON)
-        yield run(tmp_path_factory.mktemp("collected"))
+    yield run(tmp_path_factory.mktemp("collected"))
 
 
 def run(
@@ -54,15 +55,17 @@ def run(
     seed: int = 3,
     workers: int = 1,
     stepper: str = "fast",
+    after: dict[str, list[str]] | None = None,
 ) -> dict[str, Path]:
     return collect_demonstrations(
         directory,
+        [short(name, stepper=stepper) for name in episodes],
         episodes,
         valid_episodes=1,
         noise=0.2,
         seed=seed,
         workers=workers,
-        stepper=stepper,
+        after=after,
     )
 
 
@@ -118,7 +121,9 @@ def test_the_episodes_start_differently(collected: dict[str, Path]) -> None:
 def test_a_stored_seed_reproduces_its_episode(collected: dict[str, Path]) -> None:
     with h5py.File(collected["lift"]) as file:
         demo = file["data/demo_1"]
-        again = collect_episode("lift", int(demo.attrs["seed"]), noise=0.2, gains=ExpertGains())
+        lift = short("lift")
+        assert lift.record is not None
+        again = lift.record(int(demo.attrs["seed"]), noise=0.2, **lift.options)
         np.testing.assert_array_equal(again.actions, demo["actions"][:])
         np.testing.assert_array_equal(again.extras["states"], demo["states"][:])
         np.testing.assert_array_equal(again.rewards, demo["rewards"][:])
@@ -126,21 +131,19 @@ def test_a_stored_seed_reproduces_its_episode(collected: dict[str, Path]) -> Non
 
 @pytest.fixture
 def patch_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Code that worker processes run when they start; theirs must be short episodes, too."""
+    """Code that worker processes run when they start."""
 
-    def patch(code: str = "") -> None:
+    def patch(code: str) -> None:
         monkeypatch.setenv("PYTHONPATH", str(tmp_path / "patch"), prepend=os.pathsep)
         (tmp_path / "patch").mkdir()
-        start = f"import torchrl_bmrl.names\ntorchrl_bmrl.names.HORIZON = {HORIZON}\n"
-        (tmp_path / "patch" / "sitecustomize.py").write_text(start + code)
+        (tmp_path / "patch" / "sitecustomize.py").write_text(code)
 
     return patch
 
 
 def test_two_workers_write_the_same_bytes_as_one(
-    tmp_path: Path, collected: dict[str, Path], patch_workers: Callable[..., None]
+    tmp_path: Path, collected: dict[str, Path]
 ) -> None:
-    patch_workers()
     again = run(tmp_path / "two", workers=2)
     for task, path in collected.items():
         assert again[task].read_bytes() == path.read_bytes()
@@ -204,15 +207,15 @@ def test_another_seed_gives_other_episodes(tmp_path: Path, collected: dict[str, 
 def test_what_was_finished_before_a_kill_is_kept_and_not_redone(
     tmp_path: Path, collected: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real, calls = collect.collect_episode, []
+    real, calls = collect._collect_job, []
 
-    def killed_at_the_fourth(task: str, seed: int, **options: object) -> object:
+    def killed_at_the_fourth(job: EpisodeJob, report: Report) -> None:
         if len(calls) == 3:
             raise Killed
-        calls.append((task, seed))
-        return real(task, seed, **options)
+        calls.append((job.task.name, job.seed))
+        real(job, report)
 
-    monkeypatch.setattr(collect, "collect_episode", killed_at_the_fourth)
+    monkeypatch.setattr(collect, "_collect_job", killed_at_the_fourth)
     with pytest.raises(Killed):
         run(tmp_path)
     kept = files(tmp_path)
@@ -224,12 +227,12 @@ def test_what_was_finished_before_a_kill_is_kept_and_not_redone(
 
     redone = []
 
-    def counted(task: str, seed: int, **options: object) -> object:
+    def counted(job: EpisodeJob, report: Report) -> None:
         assert times == {name: (tmp_path / name).stat().st_mtime_ns for name in kept}
-        redone.append((task, seed))
-        return real(task, seed, **options)
+        redone.append((job.task.name, job.seed))
+        real(job, report)
 
-    monkeypatch.setattr(collect, "collect_episode", counted)
+    monkeypatch.setattr(collect, "_collect_job", counted)
     again = run(tmp_path)
     assert [task for task, _ in redone] == ["lift", "lift"]
     assert not set(redone) & set(calls)
@@ -243,7 +246,7 @@ def test_a_complete_collection_is_left_alone(
 ) -> None:
     first = run(tmp_path, {"lift": 1})["lift"]
     before = (first.stat().st_mtime_ns, first.read_bytes())
-    monkeypatch.setattr(collect, "collect_episode", None)  # whoever calls it fails
+    monkeypatch.setattr(collect, "_collect_job", None)  # whoever calls it fails
     assert run(tmp_path, {"lift": 1}) == {"lift": first}
     assert (first.stat().st_mtime_ns, first.read_bytes()) == before
 
@@ -272,7 +275,12 @@ def test_fewer_episodes_than_a_killed_run_had_finished_are_enough(
     assert len(read(run(tmp_path, {"lift": 1})["lift"])) == 2
 
 
-def test_an_unknown_task_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+def test_what_cannot_be_recorded_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match=r"'lfit'.*reach, lift"):
-        run(tmp_path, {"reach": 1, "lfit": 1})
+        run(tmp_path, after={"reach": ["lfit"]})
+    door = Task(name="door", files=DemonstrationFiles(path="door.hdf5"))
+    with pytest.raises(ConfigError, match="door has no expert"):
+        collect_demonstrations(
+            tmp_path, [door], {"door": 1}, valid_episodes=1, noise=0.0, seed=0, workers=1
+        )
     assert files(tmp_path) == []

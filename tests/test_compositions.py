@@ -11,24 +11,25 @@ pytest.importorskip("robosuite", exc_type=ImportError)
 
 import torch
 
-from torchrl_bmrl.envs.sawyer import SawyerEnv
-from torchrl_bmrl.envs.tasks import CUBE_HALF_SIZE, HOVER_HEIGHT, TABLE_TOP, BMRLSawyerComposition
+from torchrl_bmrl.envs.scene import CUBE_HALF_SIZE, HOVER_HEIGHT, TABLE_TOP, TabletopScene
+from torchrl_bmrl.envs.skills import Reach
+from torchrl_bmrl.envs.tabletop import TabletopEnv
 from torchrl_bmrl.envs.transforms import make_env
-from torchrl_bmrl.envs.vector import SawyerVectorEnv
+from torchrl_bmrl.envs.vector import TabletopVectorEnv
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.experts import collect
-from torchrl_bmrl.experts.collect import collect_demonstrations, collect_episode
-from torchrl_bmrl.experts.controllers import CLOSE, OPEN, ExpertGains, ReachExpert, make_expert
-from torchrl_bmrl.names import composition_stages, horizon_of
+from torchrl_bmrl.experts.collect import collect_demonstrations
+from torchrl_bmrl.experts.controllers import CLOSE, OPEN, ReachExpert, make_expert
+from torchrl_bmrl.experts.tabletop import make_task
+from torchrl_bmrl.tasks import get_task
 
 pytestmark = pytest.mark.robosuite
 
 CHAIN = "reach-lift-reach"
 
 
-def play(env: SawyerEnv, steps: int, *, stage: int | None = None) -> list[dict[str, Any]]:
+def play(env: TabletopEnv, steps: int, *, stage: int | None = None) -> list[dict[str, Any]]:
     """The composed expert's steps, until a stage begins."""
-    expert = make_expert(env.task, env.robosuite_env)
+    expert = make_expert(env.robosuite_env)
     rows = []
     for _ in range(steps):
         observation, reward, *_, info = env.step(expert())
@@ -39,9 +40,9 @@ def play(env: SawyerEnv, steps: int, *, stage: int | None = None) -> list[dict[s
     return rows
 
 
-def lifted(task: str = "lift-reach", seed: int = 0) -> SawyerEnv:
+def lifted(task: str = "lift-reach", seed: int = 0) -> TabletopEnv:
     """An environment whose cube the expert has just lifted."""
-    env = SawyerEnv(task, horizon=None)
+    env = TabletopEnv(task, horizon=None)
     env.reset(seed=seed)
     play(env, 150, stage=1)
     return env
@@ -51,18 +52,16 @@ def lifted(task: str = "lift-reach", seed: int = 0) -> SawyerEnv:
     "composition", [CHAIN, "lift-push_left", "reach-push_up-reach", "lift-push_down-reach-lift"]
 )
 def test_the_composed_expert_does_every_task_in_turn(composition: str) -> None:
-    env = SawyerEnv(composition, horizon=None)
+    env = TabletopEnv(composition, horizon=None)
     env.reset(seed=1)
-    rows = play(
-        env, 300 * len(composition_stages(composition)), stage=len(env.robosuite_env.stages)
-    )
+    rows = play(env, 300 * len(env.robosuite_env.skills), stage=len(env.robosuite_env.skills))
     stages = [int(row["stage"]) for row in rows]
     assert set(np.diff([0, *stages])) == {0, 1}
     assert [bool(row["success"]) for row in rows] == [False] * (len(rows) - 1) + [True]
 
 
 def test_the_goal_follows_the_stage() -> None:
-    env = SawyerEnv(CHAIN, horizon=None)
+    env = TabletopEnv(CHAIN, horizon=None)
     observation, info = env.reset(seed=3)
     scene = env.robosuite_env
     assert info["stage"] == 0
@@ -79,7 +78,7 @@ def test_the_goal_follows_the_stage() -> None:
 
 
 def test_rewards_are_those_of_the_task_at_hand() -> None:
-    env = SawyerEnv(CHAIN, horizon=None)
+    env = TabletopEnv(CHAIN, horizon=None)
     env.reset(seed=0)
     rows = play(env, 200)
     for row in rows:
@@ -91,19 +90,19 @@ def test_rewards_are_those_of_the_task_at_hand() -> None:
 
 
 def test_success_lasts_and_the_last_task_goes_on() -> None:
-    env = SawyerEnv("reach-reach", horizon=None)
+    env = TabletopEnv("reach-reach", horizon=None)
     env.reset(seed=0)
     play(env, 200, stage=2)
     away = np.array([0, 0, 1.0, 0, 0, 0, 0])
     infos = [env.step(away)[-1] for _ in range(15)]
     assert all(info["success"] and info["stage"] == 2 for info in infos)
-    assert not env.robosuite_env.task_success()
+    assert not env.robosuite_env.skill_success()
     np.testing.assert_array_equal(env.robosuite_env.goal, env.robosuite_env.targets[1])
 
 
 def test_a_cube_that_falls_on_the_way_is_no_success() -> None:
     env = lifted()
-    expert = ReachExpert(env.robosuite_env, ExpertGains())
+    expert = ReachExpert(env.robosuite_env)
     assert env.robosuite_env.carrying
     for _ in range(150):
         action = expert()
@@ -127,14 +126,14 @@ def test_a_push_after_a_lift_brings_the_cube_to_the_table() -> None:
 
 
 def test_a_reach_holds_the_gripper_as_it_finds_it() -> None:
-    assert ReachExpert(lifted().robosuite_env, ExpertGains())()[-1] == CLOSE
-    env = SawyerEnv("reach")
+    assert ReachExpert(lifted().robosuite_env)()[-1] == CLOSE
+    env = TabletopEnv("reach")
     env.reset(seed=0)
-    assert ReachExpert(env.robosuite_env, ExpertGains())()[-1] == OPEN
+    assert ReachExpert(env.robosuite_env)()[-1] == OPEN
 
 
 def test_an_episode_that_goes_on_from_a_state_equals_one_never_left() -> None:
-    env, other = lifted(CHAIN.removeprefix("reach-")), SawyerEnv("lift-reach", horizon=None)
+    env, other = lifted(CHAIN.removeprefix("reach-")), TabletopEnv("lift-reach", horizon=None)
     other.reset(seed=9)
     state = env.get_state()
     assert state["stage"].tolist() == [1]
@@ -148,12 +147,12 @@ def test_an_episode_that_goes_on_from_a_state_equals_one_never_left() -> None:
 
 
 def test_episodes_side_by_side_keep_their_own_stages() -> None:
-    vector = SawyerVectorEnv("reach-reach", num_envs=2)
+    vector = TabletopVectorEnv("reach-reach", num_envs=2)
     vector.reset(seed=[0, 1])
-    alone = [SawyerEnv("reach-reach", horizon=None) for _ in range(2)]
+    alone = [TabletopEnv("reach-reach", horizon=None) for _ in range(2)]
     for seed, env in enumerate(alone):
         env.reset(seed=seed)
-    expert = make_expert("reach-reach", alone[0].robosuite_env)
+    expert = make_expert(alone[0].robosuite_env)
     stages = []
     for _ in range(60):
         actions = np.stack([expert(), np.zeros(7)])
@@ -169,7 +168,7 @@ def test_episodes_side_by_side_keep_their_own_stages() -> None:
 def test_both_steppers_give_the_same_stages() -> None:
     rows = []
     for stepper in ("fast", "robosuite"):
-        env = SawyerEnv("reach-lift", horizon=None, stepper=stepper)
+        env = TabletopEnv("reach-lift", horizon=None, stepper=stepper)
         env.reset(seed=2)
         rows.append(play(env, 60))
     assert rows[0][-1]["stage"] == 2
@@ -180,7 +179,7 @@ def test_both_steppers_give_the_same_stages() -> None:
 
 
 def test_a_composition_lasts_100_steps_for_each_of_its_tasks() -> None:
-    assert horizon_of("reach-lift") == 200
+    assert get_task("reach-lift").horizon == 200
     env = make_env("reach-lift")
     data = env.rollout(500, lambda td: td.set("action", torch.zeros(7)))
     assert len(data) == 200
@@ -191,16 +190,18 @@ def test_a_composition_lasts_100_steps_for_each_of_its_tasks() -> None:
 
 def test_a_name_that_is_no_task_is_refused_with_the_valid_ones() -> None:
     with pytest.raises(UnknownNameError, match="'lfit'; valid tasks: reach, lift"):
-        SawyerEnv("reach-lfit")
+        TabletopEnv("reach-lfit")
     with pytest.raises(BMRLError, match="no tasks"):
-        BMRLSawyerComposition([])
+        TabletopScene([])
 
 
 # -- demonstrations --------------------------------------------------------------------------------
 
 
 def episode(task: str, seed: int, after: str = "") -> Any:
-    return collect_episode(task, seed, noise=0.1, gains=ExpertGains(), after=after)
+    chain = get_task(task)
+    before = tuple(get_task(name) for name in after.split("-") if name)
+    return chain.record(seed, noise=0.1, after=before, **chain.options)  # type: ignore[misc]
 
 
 def test_an_episode_after_others_begins_where_they_ended() -> None:
@@ -237,12 +238,12 @@ def test_a_demonstration_of_a_composition_knows_its_stages() -> None:
     assert "phase_names" not in chain.attributes
 
 
-def test_the_starts_of_a_task_are_taken_in_turn(tmp_path: Any, monkeypatch: Any) -> None:
+def test_the_starts_of_a_task_are_taken_in_turn(tmp_path: Any) -> None:
     from torchrl_bmrl.data.robomimic import open_episodes
 
-    monkeypatch.setattr(collect, "horizon_of", lambda task: 5)
     (path,) = collect_demonstrations(
         tmp_path,
+        [make_task(Reach(), ReachExpert, horizon=5)],
         {"reach": 2},
         valid_episodes=1,
         noise=0.1,

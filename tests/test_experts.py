@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 
 pytest.importorskip("robosuite", exc_type=ImportError)
 
-from torchrl_bmrl.envs.sawyer import SawyerEnv
-from torchrl_bmrl.errors import UnknownNameError
-from torchrl_bmrl.experts.collect import collect_episode
-from torchrl_bmrl.experts.controllers import ExpertGains, make_expert
-from torchrl_bmrl.names import TASKS
+from torchrl_bmrl.data.episodes import Episode
+from torchrl_bmrl.envs.skills import SKILLS, Lift
+from torchrl_bmrl.envs.tabletop import TabletopEnv
+from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.experts.controllers import EXPERTS, ExpertGains, make_expert
+from torchrl_bmrl.experts.tabletop import make_task
 
 pytestmark = pytest.mark.robosuite
+
+TASKS = tuple(SKILLS)
 
 PHASES = {
     "reach": ("reach",),
@@ -25,19 +29,19 @@ PHASES = {
 
 
 @pytest.fixture(scope="module")
-def envs() -> Iterator[dict[str, SawyerEnv]]:
-    made = {task: SawyerEnv(task) for task in TASKS}
+def envs() -> Iterator[dict[str, TabletopEnv]]:
+    made = {task: TabletopEnv(task) for task in TASKS}
     yield made
     for env in made.values():
         env.close()
 
 
 def act(
-    env: SawyerEnv, seed: int, *, gains: ExpertGains | None = None, steps: int = 200
+    env: TabletopEnv, seed: int, *, gains: ExpertGains | None = None, steps: int = 200
 ) -> tuple[np.ndarray, list[int], bool]:
     """Actions, phases and success of an expert without noise, up to its success."""
     env.reset(seed=seed)
-    expert = make_expert(env.task, env.robosuite_env, gains)
+    expert = make_expert(env.robosuite_env, gains)
     actions, phases = [], []
     for _ in range(steps):
         actions.append(expert())
@@ -51,13 +55,13 @@ def act(
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("task", TASKS)
 def test_an_expert_solves_its_task_phase_by_phase_within_the_action_space(
-    envs: dict[str, SawyerEnv], task: str, seed: int
+    envs: dict[str, TabletopEnv], task: str, seed: int
 ) -> None:
     actions, phases, solved = act(envs[task], seed)
     assert solved
     assert actions.shape[1] == 7
     assert np.abs(actions).max() <= 1.0
-    names = make_expert(task, envs[task].robosuite_env).phases
+    names = make_expert(envs[task].robosuite_env).phases
     # Beyond these a push can let go of a cube that it finds in the hand.
     assert names[: len(PHASES[task])] == PHASES[task]
     # Without noise nothing is dropped or slips away: every phase once, in order.
@@ -65,7 +69,7 @@ def test_an_expert_solves_its_task_phase_by_phase_within_the_action_space(
     assert (np.diff(phases) >= 0).all()
 
 
-def test_the_gripper_follows_the_phases(envs: dict[str, SawyerEnv]) -> None:
+def test_the_gripper_follows_the_phases(envs: dict[str, TabletopEnv]) -> None:
     actions, phases, _ = act(envs["lift"], 0)
     commands = {phase: set(actions[np.array(phases) == phase, 6]) for phase in (0, 1, 2)}
     assert commands[0] == {-1.0}
@@ -77,7 +81,7 @@ def test_the_gripper_follows_the_phases(envs: dict[str, SawyerEnv]) -> None:
     assert (act(envs["reach"], 0, steps=10)[0][:, 6] == -1.0).all()
 
 
-def test_free_motion_respects_the_speed_limit(envs: dict[str, SawyerEnv]) -> None:
+def test_free_motion_respects_the_speed_limit(envs: dict[str, TabletopEnv]) -> None:
     for task in ("reach", "push_up"):
         actions, _, _ = act(envs[task], 2, gains=ExpertGains(speed_limit=0.3), steps=12)
         assert np.abs(actions[:, :3]).max() == pytest.approx(0.3)
@@ -85,7 +89,7 @@ def test_free_motion_respects_the_speed_limit(envs: dict[str, SawyerEnv]) -> Non
         assert np.abs(fast[:, :3]).max() > 0.9
 
 
-def test_contact_has_a_speed_limit_of_its_own(envs: dict[str, SawyerEnv]) -> None:
+def test_contact_has_a_speed_limit_of_its_own(envs: dict[str, TabletopEnv]) -> None:
     gains = ExpertGains(speed_limit=0.9, contact_speed_limit=0.4)
     actions, phases, _ = act(envs["push_up"], 0, gains=gains)
     pushing = np.array(phases) == 2
@@ -99,11 +103,11 @@ def test_contact_has_a_speed_limit_of_its_own(envs: dict[str, SawyerEnv]) -> Non
 
 
 @pytest.mark.parametrize("task", ["lift", "push_left"])
-def test_an_expert_starts_over_after_reset(envs: dict[str, SawyerEnv], task: str) -> None:
+def test_an_expert_starts_over_after_reset(envs: dict[str, TabletopEnv], task: str) -> None:
     env = envs[task]
     first, _, _ = act(env, 3, steps=40)
     env.reset(seed=4)
-    expert = make_expert(task, env.robosuite_env)
+    expert = make_expert(env.robosuite_env)
     for _ in range(35):
         env.step(expert().astype(np.float32))
     assert expert.phase > 0
@@ -117,12 +121,13 @@ def test_an_expert_starts_over_after_reset(envs: dict[str, SawyerEnv], task: str
     np.testing.assert_array_equal(again, first)
 
 
-def test_a_seed_reproduces_an_episode_with_its_noise(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchrl_bmrl.names.HORIZON", 25)
-    gains = ExpertGains()
-    first = collect_episode("lift", 5, noise=0.3, gains=gains)
-    other = collect_episode("lift", 6, noise=0.3, gains=gains)
-    again = collect_episode("lift", 5, noise=0.3, gains=gains)
+def record(name: str, seed: int, *, horizon: int, **options: Any) -> Episode:
+    task = make_task(SKILLS[name], EXPERTS[type(SKILLS[name])], horizon=horizon)
+    return task.record(seed, **options, **task.options)  # type: ignore[misc]
+
+
+def test_a_seed_reproduces_an_episode_with_its_noise() -> None:
+    first, other, again = (record("lift", seed, horizon=25, noise=0.3) for seed in (5, 6, 5))
     for name in ("actions", "rewards"):
         np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
     for name in ("successes", "phases", "states"):
@@ -132,24 +137,28 @@ def test_a_seed_reproduces_an_episode_with_its_noise(monkeypatch: pytest.MonkeyP
     assert not np.array_equal(other.actions, first.actions)
 
 
-def test_noise_is_gaussian_of_the_size_asked_for_on_every_dimension(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("torchrl_bmrl.names.HORIZON", 60)
+def test_noise_is_gaussian_of_the_size_asked_for_on_every_dimension() -> None:
     # Slow, so that clipping to [-1, 1] leaves the noise as it was drawn.
     gains = ExpertGains(speed_limit=0.05)
-    noisy = collect_episode("reach", 0, noise=0.2, gains=gains)
+    noisy = record("reach", 0, horizon=60, noise=0.2, gains=gains)
     assert noisy.actions.dtype == np.float32
     assert np.abs(noisy.actions).max() <= 1.0
     deviation = noisy.actions[:, :6].std(axis=0)
     assert (deviation > 0.12).all()
     assert (deviation < 0.3).all()
     assert noisy.actions[:, 6].std() > 0.05  # around -1, half of it clipped
-    still = collect_episode("reach", 0, noise=0.0, gains=gains)
+    still = record("reach", 0, horizon=60, noise=0.0, gains=gains)
     assert np.abs(still.actions[:, :3]).max() <= 0.05 + 1e-6
     assert set(still.actions[:, 6]) == {-1.0}
 
 
-def test_an_unknown_task_is_answered_with_the_valid_ones(envs: dict[str, SawyerEnv]) -> None:
-    with pytest.raises(UnknownNameError, match=r"'pull'.*reach, lift, push_right"):
-        make_expert("pull", envs["reach"].robosuite_env)
+def test_a_skill_without_an_expert_needs_one_to_be_given() -> None:
+    class Raise(Lift):
+        name = "raise"
+
+    env = TabletopEnv(Raise())
+    env.reset(seed=0)
+    with pytest.raises(BMRLError, match="raise has no expert"):
+        make_expert(env.robosuite_env)
+    assert make_expert(env.robosuite_env, experts=[EXPERTS[Lift]]).phase == 0
+    env.close()

@@ -167,10 +167,10 @@ def test_what_is_as_it_should_be_is_not_warned_of(name: str) -> None:
 @pytest.mark.parametrize("task", ["reach", "lift", "push_up"])
 def test_scripted_demonstrations_are_not_warned_of(task: str, noise: float) -> None:
     pytest.importorskip("robosuite", exc_type=ImportError)
-    from torchrl_bmrl.experts.collect import collect_episode
-    from torchrl_bmrl.experts.controllers import ExpertGains
+    from torchrl_bmrl.tasks import get_task
 
-    episodes = [collect_episode(task, i, noise=noise, gains=ExpertGains()) for i in range(3)]
+    expert = get_task(task)
+    episodes = [expert.record(i, noise=noise, **expert.options) for i in range(3)]
     assert warnings_of(episodes) == []
 
 

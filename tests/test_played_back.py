@@ -16,9 +16,11 @@ pytest.importorskip("h5py")
 
 import h5py
 
-from torchrl_bmrl import names
 from torchrl_bmrl.data.schema import OBSERVATION_SHAPES
-from torchrl_bmrl.experts import collect
+from torchrl_bmrl.envs.skills import Lift
+from torchrl_bmrl.experts.collect import collect_demonstrations
+from torchrl_bmrl.experts.controllers import LiftExpert
+from torchrl_bmrl.experts.tabletop import make_task
 
 pytestmark = pytest.mark.robosuite
 
@@ -59,11 +61,10 @@ print("read")
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("played")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(names, "HORIZON", 4)
-        return collect.collect_demonstrations(
-            folder, {"lift": 2}, valid_episodes=1, noise=0.2, seed=5, workers=1
-        )["lift"]
+    task = make_task(Lift(), LiftExpert, horizon=4)
+    return collect_demonstrations(
+        folder, [task], {"lift": 2}, valid_episodes=1, noise=0.2, seed=5, workers=1
+    )["lift"]
 
 
 @pytest.mark.slow

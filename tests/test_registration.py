@@ -12,10 +12,11 @@ import pytest
 
 pytest.importorskip("gymnasium")
 
-from torchrl_bmrl.names import TASKS, gymnasium_id
+from torchrl_bmrl.envs.registration import gymnasium_id
+from torchrl_bmrl.envs.skills import SKILLS
 
 GROUP = "gymnasium.envs"
-IDS = [gymnasium_id(task) for task in (*TASKS, "reach-lift")]
+IDS = [gymnasium_id(task) for task in (*SKILLS, "reach-lift")]
 
 
 def declared() -> EntryPoint:

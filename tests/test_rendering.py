@@ -16,10 +16,10 @@ import gymnasium
 
 import torchrl_bmrl.envs  # registers the ids  # noqa: F401
 from torchrl_bmrl.envs import rendering, sawyer
-from torchrl_bmrl.envs.sawyer import SawyerEnv
-from torchrl_bmrl.envs.vector import SawyerVectorEnv
+from torchrl_bmrl.envs.registration import gymnasium_id
+from torchrl_bmrl.envs.tabletop import TabletopEnv
+from torchrl_bmrl.envs.vector import TabletopVectorEnv
 from torchrl_bmrl.errors import BMRLError, RenderError
-from torchrl_bmrl.names import gymnasium_id
 
 pytestmark = pytest.mark.robosuite
 
@@ -82,7 +82,7 @@ def test_a_library_of_ones_own_choice_is_the_only_one_that_is_tried() -> None:
     assert "egl" not in said
 
 
-@pytest.mark.parametrize("make", [SawyerEnv, SawyerVectorEnv])
+@pytest.mark.parametrize("make", [TabletopEnv, TabletopVectorEnv])
 def test_an_environment_that_cannot_draw_is_refused_at_once(
     make: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -97,7 +97,7 @@ def test_an_environment_that_cannot_draw_is_refused_at_once(
 
 def test_episodes_side_by_side_are_drawn_as_each_alone_and_go_on_as_undrawn(library: str) -> None:
     vector = gymnasium.make_vec(gymnasium_id("lift"), num_envs=2, render_mode="rgb_array")
-    undrawn = SawyerVectorEnv("lift", num_envs=2)
+    undrawn = TabletopVectorEnv("lift", num_envs=2)
     with pytest.raises(BMRLError, match="starts with reset"):
         vector.render()
     vector.reset(seed=[3, 4])
@@ -111,7 +111,7 @@ def test_episodes_side_by_side_are_drawn_as_each_alone_and_go_on_as_undrawn(libr
     pictures = vector.render()
     assert len(pictures) == 2
     for i, picture in enumerate(pictures):
-        alone = SawyerEnv("lift", render_mode="rgb_array")
+        alone = TabletopEnv("lift", render_mode="rgb_array")
         alone.reset(seed=3 + i)
         for action in ACTIONS[:, i]:
             alone.step(action)
@@ -123,7 +123,7 @@ def test_episodes_side_by_side_are_drawn_as_each_alone_and_go_on_as_undrawn(libr
 
 
 def test_pictures_may_be_larger_than_mujocos_own_buffer(library: str) -> None:
-    env = SawyerEnv("reach", render_mode="rgb_array", image_size=(720, 960))
+    env = TabletopEnv("reach", render_mode="rgb_array", image_size=(720, 960))
     env.reset(seed=0)
     assert env.render().shape == (720, 960, 3)
     env.close()

@@ -29,9 +29,9 @@ from torchrl_bmrl.data.robosuite import (
     _gripper_commands,
     open_episodes,
 )
-from torchrl_bmrl.envs.tasks import make_robosuite_env
+from torchrl_bmrl.envs.scene import TabletopScene
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
-from torchrl_bmrl.experts.controllers import ExpertGains, make_expert
+from torchrl_bmrl.experts.controllers import make_expert
 
 pytestmark = pytest.mark.robosuite
 
@@ -55,9 +55,9 @@ class Recorded:
 
 def record(path: Path, task: str, steps: int, seed: int = 0) -> Recorded:
     """Records an episode of a task's expert in the layout of today's robosuite."""
-    env = make_robosuite_env(task, use_object_obs=False, seed=seed)
+    env = TabletopScene(task, use_object_obs=False, seed=seed)
     env.reset()
-    expert = make_expert(task, env, ExpertGains())
+    expert = make_expert(env)
     observations, states = [env.named_observation()], [env.sim.get_state().flatten()]
     actions, rewards, successes = [], [], []
     for _ in range(steps):
@@ -610,12 +610,12 @@ ODD = (
 def test_every_odd_recording_is_refused_by_name_or_gives_a_step_for_each_interval(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from torchrl_bmrl.envs import tasks
+    from torchrl_bmrl.envs import scene
 
     whole = record(tmp_path / "whole.hdf5", "lift", 12)
-    env = make_robosuite_env("lift", use_object_obs=False)
+    env = TabletopScene("lift", use_object_obs=False)
     monkeypatch.setattr(env, "close", lambda: None)
-    monkeypatch.setattr(tasks, "make_robosuite_env", lambda *_, **__: env)  # one for all files
+    monkeypatch.setattr(scene, "TabletopScene", lambda *_, **__: env)  # one for all files
     outcomes = {True: 0, False: 0}
     for number in range(208):
         change = ODD[number % len(ODD)]

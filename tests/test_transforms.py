@@ -157,7 +157,7 @@ def test_a_part_that_never_changes_stays_finite() -> None:
 @pytest.mark.robosuite
 def test_data_and_environment_give_the_same_observation_for_the_same_episode() -> None:
     pytest.importorskip("robosuite", exc_type=ImportError)
-    from torchrl_bmrl.envs.sawyer import SawyerEnv
+    from torchrl_bmrl.envs.tabletop import TabletopEnv
     from torchrl_bmrl.envs.transforms import make_env
 
     rng = np.random.default_rng(0)
@@ -167,7 +167,7 @@ def test_data_and_environment_give_the_same_observation_for_the_same_episode() -
     )
     actions = rng.uniform(-1, 1, (8, 7)).astype(np.float32)
 
-    env = SawyerEnv("push_left")
+    env = TabletopEnv("push_left")
     parts, _ = env.reset(seed=7)
     shown, rewards = [parts], []
     for action in actions:

@@ -14,11 +14,12 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 import torchrl_bmrl.envs  # registers the ids  # noqa: F401
-from torchrl_bmrl.envs.sawyer import SawyerEnv
+from torchrl_bmrl.envs.registration import gymnasium_id
+from torchrl_bmrl.envs.skills import SKILLS
+from torchrl_bmrl.envs.tabletop import TabletopEnv
 from torchrl_bmrl.envs.transforms import make_env
-from torchrl_bmrl.envs.vector import SawyerVectorEnv
+from torchrl_bmrl.envs.vector import TabletopVectorEnv
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.names import TASKS, gymnasium_id
 
 pytestmark = pytest.mark.robosuite
 
@@ -29,7 +30,7 @@ ACTIONS[:, 6] = np.sign(np.sin(np.arange(60)))  # the gripper is never at rest
 
 def test_each_episode_side_by_side_equals_the_one_alone() -> None:
     seeds = [7, 3, 11]
-    vector, env = SawyerVectorEnv("lift", num_envs=3, horizon=20), SawyerEnv("lift", horizon=20)
+    vector, env = TabletopVectorEnv("lift", num_envs=3, horizon=20), TabletopEnv("lift", horizon=20)
     actions = np.stack([ACTIONS[:20], -ACTIONS[:20], ACTIONS[20:40]], 1)
     shown = [vector.reset(seed=seeds), *(vector.step(action) for action in actions)]
     for i, seed in enumerate(seeds):
@@ -45,7 +46,7 @@ def test_each_episode_side_by_side_equals_the_one_alone() -> None:
 
 
 def test_some_episodes_start_anew_while_others_go_on() -> None:
-    vector = SawyerVectorEnv("push_left", num_envs=3)
+    vector = TabletopVectorEnv("push_left", num_envs=3)
     before, _ = vector.reset(seed=0)
     again, _ = vector.reset(seed=0)
     np.testing.assert_array_equal(before["goal_pos"], again["goal_pos"])
@@ -68,8 +69,8 @@ def test_some_episodes_start_anew_while_others_go_on() -> None:
 
 def test_bad_calls_of_a_vector_environment_are_answered() -> None:
     with pytest.raises(BMRLError, match="num_envs is 0"):
-        SawyerVectorEnv("reach", num_envs=0)
-    vector = SawyerVectorEnv("reach", num_envs=2)
+        TabletopVectorEnv("reach", num_envs=0)
+    vector = TabletopVectorEnv("reach", num_envs=2)
     with pytest.raises(BMRLError, match="starts with reset"):
         vector.step(np.zeros((2, 7)))
     with pytest.raises(BMRLError, match="3 seeds for 2 environments"):
@@ -94,10 +95,10 @@ def test_bad_calls_of_a_vector_environment_are_answered() -> None:
     vector.close()
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", SKILLS)
 def test_torchrl_and_gymnasium_take_the_vector_environment(task: str) -> None:
     made = gymnasium.make_vec(gymnasium_id(task), num_envs=2)
-    assert isinstance(made, SawyerVectorEnv)
+    assert isinstance(made, TabletopVectorEnv)
     made.close()
     env = make_env(task, num_envs=2)
     assert env.batch_size == (2,)

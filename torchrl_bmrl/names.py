@@ -1,18 +1,10 @@
-"""Names that every part of the library shares: tasks, their order, directions."""
+"""Names that every part of the library shares: tasks and their order."""
 
 from __future__ import annotations
 
 from torchrl_bmrl.errors import UnknownNameError
 
-PUSH_DIRECTIONS: dict[str, tuple[float, float, float]] = {
-    "right": (0.0, -1.0, 0.0),
-    "left": (0.0, 1.0, 0.0),
-    "up": (1.0, 0.0, 0.0),
-    "down": (-1.0, 0.0, 0.0),
-}
-"""Unit vectors seen from the robot's base: +x away from it, +y to its left."""
-
-TASKS: tuple[str, ...] = ("reach", "lift", *(f"push_{name}" for name in PUSH_DIRECTIONS))
+TASKS = ("reach", "lift", "push_right", "push_left", "push_up", "push_down")
 """The six tasks; a task's position is its class index ``task``."""
 
 HORIZON = 200
@@ -77,21 +69,3 @@ def horizon_of(task: str) -> int:
     """
     stages = composition_stages(task)
     return HORIZON if len(stages) == 1 else STAGE_HORIZON * len(stages)
-
-
-def gymnasium_id(task: str) -> str:
-    """Registered gymnasium id of a task; all compositions share one, which takes ``task``.
-
-    Args:
-        task: one of :data:`TASKS`, or several joined by ``-``.
-
-    Raises:
-        UnknownNameError: if one of them is not a task.
-
-    Example:
-        >>> gymnasium_id("push_left"), gymnasium_id("reach-lift")
-        ('bmrl/SawyerPushLeft-v0', 'bmrl/SawyerComposition-v0')
-    """
-    stages = composition_stages(task)
-    name = "composition" if len(stages) > 1 else task
-    return f"bmrl/Sawyer{name.title().replace('_', '')}-v0"

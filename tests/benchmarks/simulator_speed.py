@@ -29,7 +29,7 @@ import mujoco
 import numpy as np
 import torch
 
-from torchrl_bmrl.envs.sawyer import SawyerEnv
+from torchrl_bmrl.envs.tabletop import TabletopEnv
 from torchrl_bmrl.envs.transforms import make_env
 from torchrl_bmrl.evaluation.rollout import evaluate_policy
 from torchrl_bmrl.experts.collect import collect_demonstrations
@@ -48,10 +48,10 @@ def seconds(call: Callable[[], object]) -> float:
     return perf_counter() - start
 
 
-def episode(env: SawyerEnv, steps: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def episode(env: TabletopEnv, steps: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Actions of a noisy expert, and the states in which they were taken."""
     env.reset(seed=0)
-    expert, rng = make_expert(env.task, env.robosuite_env), np.random.default_rng(0)
+    expert, rng = make_expert(env.robosuite_env), np.random.default_rng(0)
     actions, states = [], []
     for _ in range(steps):
         states.append(env.get_state()["physics"])
@@ -60,13 +60,13 @@ def episode(env: SawyerEnv, steps: int) -> tuple[list[np.ndarray], list[np.ndarr
     return actions, states
 
 
-def play(env: SawyerEnv, actions: list[np.ndarray]) -> float:
+def play(env: TabletopEnv, actions: list[np.ndarray]) -> float:
     """Time of an episode's steps."""
     env.reset(seed=0)
     return sum(seconds(lambda: env.step(action)) for action in actions)  # noqa: B023
 
 
-def bare(env: SawyerEnv, states: list[np.ndarray]) -> float:
+def bare(env: TabletopEnv, states: list[np.ndarray]) -> float:
     """Time of the physics alone from the same states."""
     model, data = env.robosuite_env.sim.model._model, env.robosuite_env.sim.data._data
     substeps, total = int(0.05 / model.opt.timestep), 0.0
@@ -87,7 +87,7 @@ def step_table(rounds: int, steps: int = HORIZON) -> None:
     print("\n| Task | robosuite | fast | bare, robosuite's model | bare, lean | fast / robosuite |"
           " fast / bare (robosuite's, lean) |\n|---|---:|---:|---:|---:|---:|---:|")  # fmt: skip
     for task in TASKS:
-        stock, fast = (SawyerEnv(task, stepper=name) for name in reversed(STEPPERS))
+        stock, fast = (TabletopEnv(task, stepper=name) for name in reversed(STEPPERS))
         actions, states = episode(fast, steps)
         play(stock, actions[:3])  # compiled, and in the caches
         times = [
@@ -140,12 +140,12 @@ import sys
 from pathlib import Path
 def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4 / 1024
-from torchrl_bmrl.envs.sawyer import SawyerEnv
+from torchrl_bmrl.envs.tabletop import TabletopEnv
 import torchrl.envs
 stepper, number = sys.argv[1], int(sys.argv[2])
 before, envs = resident(), []
 for _ in range(number):
-    envs.append(SawyerEnv("lift", stepper=stepper))
+    envs.append(TabletopEnv("lift", stepper=stepper))
     envs[-1].reset(seed=0)
     envs[-1].step(envs[-1].action_space.sample())
 print(f"{before:.0f} | {resident():.0f}")

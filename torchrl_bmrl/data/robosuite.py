@@ -33,7 +33,7 @@ from torchrl_bmrl.names import check_task
 if TYPE_CHECKING:
     import mujoco
 
-    from torchrl_bmrl.envs.tasks import _BMRLSawyerTask
+    from torchrl_bmrl.envs.scene import TabletopScene
 
 TRACKING = 0.22
 """Share of a commanded position delta that the arm covers in one step, measured.
@@ -145,11 +145,11 @@ def open_episodes(
             raise DataError(path, "data", "no demonstrations")
 
         @cache
-        def env() -> _BMRLSawyerTask:
+        def env() -> TabletopScene:
             # Loads the simulator: only once a recording has been read.
-            from torchrl_bmrl.envs.tasks import make_robosuite_env
+            from torchrl_bmrl.envs.scene import TabletopScene
 
-            made = make_robosuite_env(task, use_object_obs=False)
+            made = TabletopScene(task, use_object_obs=False)
             stack.callback(made.close)
             return made
 
@@ -239,7 +239,7 @@ def _set_cube_size(scene: _Scene, size: np.ndarray) -> None:
     model.bvh_aabb[first : first + model.body_bvhnum[body], 3:] = size
 
 
-def _transfer(recording: Recording, env: _BMRLSawyerTask, there: _Scene, rows: np.ndarray) -> Any:
+def _transfer(recording: Recording, env: TabletopScene, there: _Scene, rows: np.ndarray) -> Any:
     """The task's states (N, 1 + nq + nv) and scene for the recording's; sets cube and goal."""
     here = _find_scene(recording, env.sim.model._model, cube=env.has_cube)
     # The table and not the robot's base ties the scenes together: the bases differ by 1 mm in
@@ -261,7 +261,7 @@ def _transfer(recording: Recording, env: _BMRLSawyerTask, there: _Scene, rows: n
     return states, here
 
 
-def _observe(env: _BMRLSawyerTask, states: np.ndarray) -> tuple[dict[str, np.ndarray], Any]:
+def _observe(env: TabletopScene, states: np.ndarray) -> tuple[dict[str, np.ndarray], Any]:
     """The task's view of its states: parts of the observation; rotations, rewards, successes."""
     seen: dict[str, list[Any]] = {}
     for state in states:
@@ -279,7 +279,7 @@ def _observe(env: _BMRLSawyerTask, states: np.ndarray) -> tuple[dict[str, np.nda
 
 
 def _recorded_path(
-    recording: Recording, env: _BMRLSawyerTask, there: _Scene, here: _Scene, rows: np.ndarray
+    recording: Recording, env: TabletopScene, there: _Scene, here: _Scene, rows: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The end-effector's path (N, 3) [m] by the recording's model, and rotations (N, 3, 3).
 
@@ -300,7 +300,7 @@ def _recorded_path(
     return path, rotations
 
 
-def _relabel(recording: Recording, env: _BMRLSawyerTask, tracking: float) -> Episode:
+def _relabel(recording: Recording, env: TabletopScene, tracking: float) -> Episode:
     there = _find_scene(recording, recording.model, cube=env.has_cube)
     rows = resample(recording, env.control_freq)
     states, here = _transfer(recording, env, there, rows)
@@ -361,9 +361,10 @@ def _gripper_commands(opening: np.ndarray) -> np.ndarray:
     something stops (the cube, each other) keep the command that brought them there. Before the
     first motion whatever is not open is closing.
     """
-    from torchrl_bmrl.envs.tasks import GRIPPER_OPEN
+    from torchrl_bmrl.envs.arms import OPEN_FINGERS
 
-    rest = GRIPPER_OPEN @ [1.0, -1.0] - FINGER_REST
+    left, right = OPEN_FINGERS["RethinkGripper"]
+    rest = left - right - FINGER_REST
     commands, command = [], 1.0
     for before, after in itertools.pairwise(opening):
         if before - after > CLOSING_MOTION:

@@ -331,7 +331,7 @@ def _open_robosuite(stack: ExitStack, path: Path, task: str | None, tracking: fl
         raise ConfigError(
             f"{path} holds simulator states alone; valid: --task, the task whose scene it is"
         )
-    from torchrl_bmrl.envs.tasks import robosuite_metadata
+    from torchrl_bmrl.envs.robosuite_names import robosuite_metadata
 
     episodes = stack.enter_context(robosuite.open_episodes(path, task=task, tracking=tracking))
 

@@ -1,31 +1,53 @@
-"""gymnasium ids of the six tasks; importing :mod:`torchrl_bmrl.envs` registers them."""
+"""gymnasium ids of the tabletop tasks; importing :mod:`torchrl_bmrl.envs` registers them."""
 
 from __future__ import annotations
 
+from torchrl_bmrl.envs.skills import SKILLS, make_skills
 from torchrl_bmrl.extras import needs
-from torchrl_bmrl.names import TASKS, gymnasium_id, horizon_of
 
-with needs("robosuite"):
-    # As a plugin this is called while gymnasium itself is imported.
-    from gymnasium.envs import registration
+
+def gymnasium_id(task: str) -> str:
+    """The registered id of a task; all compositions share one.
+
+    Args:
+        task: names of :data:`~torchrl_bmrl.envs.skills.SKILLS`, joined by ``-``.
+
+    Raises:
+        UnknownNameError: if one of them is not a skill.
+
+    Example:
+        >>> gymnasium_id("push_left"), gymnasium_id("reach-lift")
+        ('bmrl/SawyerPushLeft-v0', 'bmrl/SawyerComposition-v0')
+    """
+    name = "composition" if len(make_skills(task)) > 1 else task
+    return f"bmrl/Sawyer{name.title().replace('_', '')}-v0"
 
 
 def register() -> None:
     """Registers ``bmrl/SawyerReach-v0``, its five siblings and the compositions (idempotent).
+
+    ``robot="Panda"`` gives an id another arm, ``skills=`` the compositions' id other skills.
 
     Example:
         >>> register()
         >>> import gymnasium
         >>> gymnasium.spec("bmrl/SawyerReach-v0").kwargs["horizon"]
         200
+
+    Raises:
+        MissingExtraError: without gymnasium.
     """
-    for task in (*TASKS, "reach-lift-reach"):
+    with needs("robosuite"):
+        # As a plugin this is called while gymnasium itself is imported.
+        from gymnasium.envs import registration
+
+    for task, horizon in {**dict.fromkeys(SKILLS, 200), "reach-lift-reach": 300}.items():
         if gymnasium_id(task) not in registration.registry:
             registration.register(
                 gymnasium_id(task),
-                entry_point="torchrl_bmrl.envs.sawyer:SawyerEnv",
-                vector_entry_point="torchrl_bmrl.envs.vector:SawyerVectorEnv",
-                # Not gymnasium's TimeLimit: its count is not part of a state that one returns to.
-                kwargs={"task": task, "horizon": horizon_of(task)},
+                entry_point="torchrl_bmrl.envs.tabletop:TabletopEnv",
+                vector_entry_point="torchrl_bmrl.envs.vector:TabletopVectorEnv",
+                # gymnasium's TimeLimit would count anew when a state is restored.
+                kwargs={"skills": task, "horizon": horizon},
                 disable_env_checker=True,
             )

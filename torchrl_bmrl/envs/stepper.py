@@ -19,7 +19,7 @@ import numpy as np
 
 from torchrl_bmrl.envs.caching import cached_njit
 from torchrl_bmrl.envs.physics import mujoco_library
-from torchrl_bmrl.envs.tasks import _BMRLSawyerTask
+from torchrl_bmrl.envs.scene import TabletopScene
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.extras import needs
 
@@ -175,7 +175,7 @@ def _control_period(
     _mj_fwd_position(robot.model, robot.data)
 
 
-def why_not_fast(env: _BMRLSawyerTask) -> str | None:
+def why_not_fast(env: TabletopScene) -> str | None:
     """What keeps :class:`FastStepper` from standing in for ``env.step``, or ``None``.
 
     Args:
@@ -230,8 +230,7 @@ class FastStepper:
         BMRLError: if :func:`why_not_fast` gives a reason.
 
     Example:
-        >>> from torchrl_bmrl.envs.tasks import make_robosuite_env
-        >>> env = make_robosuite_env("lift", seed=0, use_object_obs=False)
+        >>> env = TabletopScene("lift", seed=0, use_object_obs=False)
         >>> _ = env.reset()
         >>> before = env.eef_position
         >>> FastStepper(env).step(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0]))
@@ -239,7 +238,7 @@ class FastStepper:
         True
     """
 
-    def __init__(self, env: _BMRLSawyerTask) -> None:
+    def __init__(self, env: TabletopScene) -> None:
         if (reason := why_not_fast(env)) is not None:
             raise BMRLError(f"no fast step here: {reason}")
         robot, self.sim = env.robots[0], env.sim
@@ -301,7 +300,7 @@ class FastStepper:
         }
         self._products = _Products(**{name: id(each) for name, each in self._arguments.items()})
 
-    def serves(self, env: _BMRLSawyerTask) -> bool:
+    def serves(self, env: TabletopScene) -> bool:
         """Whether ``env`` still is as it was: no reset since, the same simulator."""
         return self.sim is env.sim and self.composite is env.robots[0].composite_controller
 

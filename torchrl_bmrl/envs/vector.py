@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_bmrl.envs.sawyer import SawyerEnv
+from torchrl_bmrl.envs.skills import SkillLike
+from torchrl_bmrl.envs.tabletop import TabletopEnv
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.extras import needs
 
@@ -16,25 +17,26 @@ with needs("robosuite"):
     from gymnasium.vector.utils import batch_space
 
 
-class SawyerVectorEnv(VectorEnv):
-    """``num_envs`` episodes of one Sawyer task; an episode costs its state, 3 kB.
+class TabletopVectorEnv(VectorEnv):
+    """``num_envs`` episodes of the same skills; each costs the memory of its state, 3 kB.
 
-    One :class:`~torchrl_bmrl.envs.sawyer.SawyerEnv` plays them in turn, each from the state that it
-    had: a policy acts in all of them with one call, and memory stays that of one environment. Each
-    episode equals the one that ``SawyerEnv`` gives, to the bit.
+    One :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv` plays them in turn and restores the state
+    of each. A policy acts in all of them with one call. Each episode equals that of a
+    ``TabletopEnv`` of its own to the bit.
 
-    Nothing resets itself (``AutoresetMode.DISABLED``, what TorchRL's ``GymWrapper`` expects).
+    Episodes are not reset automatically (``AutoresetMode.DISABLED``, as TorchRL's ``GymWrapper``
+    expects).
 
     Args:
-        task: one of :data:`torchrl_bmrl.names.TASKS`.
-        num_envs: episodes.
-        **kwargs: of ``SawyerEnv``.
+        skills: as for ``TabletopEnv``.
+        num_envs: number of episodes.
+        **kwargs: other arguments of ``TabletopEnv``.
 
     Raises:
-        BMRLError: for less than one environment, and as ``SawyerEnv``.
+        BMRLError: for less than one environment, and for what ``TabletopEnv`` refuses.
 
     Example:
-        >>> env = SawyerVectorEnv("push_up", num_envs=3)
+        >>> env = TabletopVectorEnv("push_up", num_envs=3)
         >>> observation, info = env.reset(seed=[4, 5, 6])
         >>> observation["goal_pos"].shape
         (3, 3)
@@ -43,20 +45,23 @@ class SawyerVectorEnv(VectorEnv):
         ((3,), array([False, False, False]))
     """
 
-    def __init__(self, task: str, num_envs: int = 1, **kwargs: Any) -> None:
+    def __init__(
+        self, skills: SkillLike | Sequence[SkillLike], num_envs: int = 1, **kwargs: Any
+    ) -> None:
         if num_envs < 1:
             raise BMRLError(f"num_envs is {num_envs}; valid: at least 1")
-        self._env = SawyerEnv(task, **kwargs)
-        self.metadata = {**SawyerEnv.metadata, "autoreset_mode": AutoresetMode.DISABLED}
+        self._env = TabletopEnv(skills, **kwargs)
+        self.metadata = {**TabletopEnv.metadata, "autoreset_mode": AutoresetMode.DISABLED}
         self.autoreset_mode = AutoresetMode.DISABLED
         self.num_envs = num_envs
         self.render_mode = self._env.render_mode
+        self.reward_terms = self._env.reward_terms
         self.single_observation_space = self._env.observation_space
         self.single_action_space = self._env.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._states: list[dict[str, np.ndarray] | None] = [None] * num_envs
-        self._shown: list[Any] = [None] * num_envs  # what each episode showed last
+        self._shown: list[Any] = [None] * num_envs  # each episode's last observation and info
 
     def reset(
         self,
@@ -67,13 +72,14 @@ class SawyerVectorEnv(VectorEnv):
         """Starts episodes.
 
         Args:
-            seed: of each, or of the first, from which the others count up.
-            options: ``{"reset_mask": mask}`` starts those of a mask ``(num_envs,)`` alone;
-                ``{"states": states}`` goes on from states of :meth:`get_states`.
+            seed: a sequence with one for each episode, or that of the first; the others then count
+                up from it.
+            options: ``{"reset_mask": mask}`` starts only the episodes of a mask ``(num_envs,)``;
+                ``{"states": states}`` continues from states of :meth:`get_states`.
 
         Raises:
-            BMRLError: if there are more or fewer seeds or states than environments, or a state is
-                not one; every episode is then as it was.
+            BMRLError: if the number of seeds or states is not that of the episodes, or a state is
+                not valid; no episode changes then.
         """
         options = options or {}
         if seed is None or isinstance(seed, int | np.integer):
@@ -92,7 +98,7 @@ class SawyerVectorEnv(VectorEnv):
             wanted = None if states[i] is None else {"state": states[i]}
             shown[i] = self._env.reset(seed=seed[i], options=wanted)
             started[i] = self._env.get_state()
-        self._shown, self._states = shown, started  # all, or none if a state is refused
+        self._shown, self._states = shown, started  # only now: a state may be refused
         observations, infos = zip(*self._shown, strict=True)
         return _stack(observations), _stack(infos)
 
@@ -105,7 +111,7 @@ class SawyerVectorEnv(VectorEnv):
             actions: ``(num_envs, 7)``.
 
         Raises:
-            BMRLError: if there is no action for each, or one is not finite; nothing has moved then.
+            BMRLError: if the shape is another one or an action is not finite; nothing moves then.
         """
         actions = np.asarray(actions, dtype=np.float64)
         if actions.shape != self.action_space.shape or not np.isfinite(actions).all():
@@ -126,7 +132,7 @@ class SawyerVectorEnv(VectorEnv):
         )
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """Picture of each episode, as ``SawyerEnv.render`` gives it; ``None`` without a mode.
+        """Picture of each episode, as ``TabletopEnv.render`` gives it; ``None`` without a mode.
 
         Raises:
             BMRLError: before the first reset.
@@ -140,7 +146,7 @@ class SawyerVectorEnv(VectorEnv):
         return tuple(pictures)
 
     def get_states(self) -> list[dict[str, np.ndarray]]:
-        """State of each episode, as ``SawyerEnv.get_state`` gives it.
+        """State of each episode, as ``TabletopEnv.get_state`` gives it.
 
         Raises:
             BMRLError: before the first reset.

@@ -8,8 +8,8 @@ from collections.abc import Hashable, Iterable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from torchrl_bmrl.envs.skills import PUSH_DIRECTIONS
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.names import PUSH_DIRECTIONS
 
 LIFTED = 0.05
 """A cube that rose so far counts as lifted [m]: the lift task's own height."""

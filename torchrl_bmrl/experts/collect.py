@@ -1,13 +1,12 @@
-"""Episodes of the scripted experts, one file each until a task is complete."""
+"""Collects the episodes of scripted experts, each in a file of its own until a task is complete."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import (
@@ -16,18 +15,12 @@ from torchrl_bmrl.data.robomimic import (
     read_kept_episode,
     write_episodes,
 )
-from torchrl_bmrl.envs.sawyer import SawyerEnv
-from torchrl_bmrl.envs.tasks import robosuite_metadata
-from torchrl_bmrl.errors import BMRLError, DataError
-from torchrl_bmrl.experts.controllers import ExpertGains, make_expert
-from torchrl_bmrl.names import (
-    STAGE_HORIZON,
-    TASKS,
-    check_task,
-    composition_stages,
-    horizon_of,
-)
+from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
+from torchrl_bmrl.tasks import Task, get_task
+
+ENV_ARGS = "env_args"
+"""Attribute of a recorded episode that becomes robomimic's ``env_args`` of the file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,137 +31,28 @@ class EpisodeJob:
         task: its task.
         seed: decides start and noise.
         noise: standard deviation of the Gaussian noise on each action dimension.
-        path: where the episode is kept.
-        gains: of the expert.
-        stepper: of :class:`~torchrl_bmrl.envs.sawyer.SawyerEnv`.
-        after: tasks that the expert does before, joined by ``-``.
+        path: where the episode is stored.
+        gains: of the expert; ``None`` for its defaults.
+        after: tasks whose experts act before the episode begins.
 
     Example:
-        >>> job = EpisodeJob(task="lift", seed=0, noise=0.2, path=Path("00000.npz"))
-        >>> job.stepper, job.gains.grasp_steps
-        ('fast', 10)
+        >>> job = EpisodeJob(task=get_task("lift"), seed=0, noise=0.2, path=Path("00000.npz"))
+        >>> job.task.options["stepper"]
+        'fast'
     """
 
-    task: str
+    task: Task
     seed: int
     noise: float
     path: Path
-    gains: ExpertGains = field(default_factory=ExpertGains)
-    stepper: str = "fast"
-    after: str = ""
-
-
-_kept: SawyerEnv | None = None
-
-
-def _env(task: str, stepper: str) -> SawyerEnv:
-    # Building one with its pictures takes a second: the last one is kept.
-    global _kept
-    if _kept is None or (_kept.task, _kept.stepper) != (task, stepper):
-        if _kept is not None:
-            _kept.close()
-        _kept = SawyerEnv(task, stepper=stepper)
-    return _kept
-
-
-def collect_episode(
-    task: str,
-    seed: int,
-    *,
-    noise: float,
-    gains: ExpertGains,
-    stepper: str = "fast",
-    after: str = "",
-) -> Episode:
-    """One episode of the expert, reproduced by ``seed``.
-
-    Args:
-        task: one of the six (200 steps), or a composition (100 steps for each of its tasks).
-        seed: decides start and noise.
-        noise: standard deviation of the Gaussian noise on each action dimension.
-        gains: of the expert.
-        stepper: of :class:`~torchrl_bmrl.envs.sawyer.SawyerEnv`.
-        after: tasks that the expert does before, joined by ``-``: the episode begins where the last
-            of them succeeded, with arm, gripper and cube as they are then. Empty: where the task
-            itself begins.
-
-    Returns:
-        the episode, with the extras ``successes``, ``states`` and, of a task, ``phases``, of a
-        composition ``stages``.
-
-    Raises:
-        UnknownNameError: for a name that is not a task.
-        BMRLError: if the expert never does ``after``, in 100 starts.
-
-    Example:
-        >>> episode = collect_episode("reach", seed=0, noise=0.2, gains=ExpertGains())
-        >>> len(episode), bool(episode.extras["successes"].any())
-        (200, True)
-    """
-    env = _env(f"{after}-{task}" if after else task, stepper)
-    scene = env.robosuite_env
-    rng = np.random.default_rng(derive_seed(seed, "action noise"))
-
-    def act() -> np.ndarray:
-        # What is stored is what was executed, to the bit.
-        return np.clip(expert() + noise * rng.standard_normal(7), -1.0, 1.0).astype(np.float32)
-
-    before = len(composition_stages(after)) if after else 0
-    for attempt in range(100):
-        observation, _ = env.reset(seed=derive_seed(seed, "again", attempt) if attempt else seed)
-        expert = make_expert(env.task, scene, gains)
-        while scene.stage < before and scene.timestep < STAGE_HORIZON * before:
-            observation, *_ = env.step(act())
-        if scene.stage == before:
-            break
-    else:
-        raise BMRLError(f"the expert never came to {task} after {after}; valid: what it can do")
-    observations = {name: [part] for name, part in observation.items()}
-    model_file = scene.scene_xml()
-    actions, rewards, successes, phases, states, stages = [], [], [], [], [], []
-    for _ in range(horizon_of(task)):
-        action = act()
-        phases.append(expert.phase)
-        states.append(scene.sim.get_state().flatten())
-        stages.append(scene.stage - before)
-        observation, reward, _, _, info = env.step(action)
-        for name, part in observation.items():
-            observations[name].append(part)
-        actions.append(action)
-        rewards.append(reward)
-        successes.append(scene.task_success() if after else info["success"])
-    parts = {name: np.stack(rows) for name, rows in observations.items()}
-    return Episode(
-        observations={name: part[:-1] for name, part in parts.items()},
-        next_observations={name: part[1:] for name, part in parts.items()},
-        actions=np.stack(actions),
-        rewards=np.array(rewards),
-        terminated=np.zeros(len(actions), dtype=bool),
-        extras={
-            "successes": np.array(successes),
-            # A composition's experts differ in what their phases are: it has stages instead.
-            **({} if "-" in task else {"phases": np.array(phases, dtype=np.int8)}),
-            "states": np.stack(states),
-            **({"stages": np.array(stages, dtype=np.int8)} if "-" in task else {}),
-        },
-        # robomimic plays states back in the model of the demonstration.
-        attributes={
-            "seed": seed,
-            **({} if "-" in task else {"phase_names": list(expert.phases)}),
-            "model_file": model_file,
-            **({"after": after} if after else {}),
-        },
-    )
+    gains: Any = None
+    after: tuple[Task, ...] = ()
 
 
 def _collect_job(job: EpisodeJob, report: Report) -> None:
-    episode = collect_episode(
-        job.task,
-        job.seed,
-        noise=job.noise,
-        gains=job.gains,
-        stepper=job.stepper,
-        after=job.after,
+    assert job.task.record is not None
+    episode = job.task.record(
+        job.seed, noise=job.noise, gains=job.gains, after=job.after, **job.task.options
     )
     keep_episode(job.path, episode)
     report(1)
@@ -176,45 +60,47 @@ def _collect_job(job: EpisodeJob, report: Report) -> None:
 
 def collect_demonstrations(
     directory: Path,
-    episodes: dict[str, int],
+    tasks: Sequence[Task],
+    episodes: Mapping[str, int],
     *,
     valid_episodes: int,
     noise: float,
     seed: int,
     workers: int,
-    gains: ExpertGains | None = None,
-    stepper: str = "fast",
+    gains: Any = None,
     after: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, Path]:
-    """Collects demonstrations, one robomimic-layout HDF5 file per task.
+    """Collects demonstrations, one file in robomimic's layout per task.
 
-    Every finished episode is kept under ``directory/.episodes`` at once; the same call after a kill
-    goes on with the missing ones. A task's file appears, complete, when its last episode is there.
+    Every finished episode is stored under ``directory/.episodes`` at once. The same call after a
+    kill collects only the missing ones. A task's file appears when its last episode is there.
 
     Args:
         directory: where ``<task>.hdf5`` is written.
-        episodes: number of episodes to train on, by task.
+        tasks: tasks with ``record``; they are collected in this order.
+        episodes: number of episodes to train on, by the task's name.
         valid_episodes: further episodes of each task, held out under ``mask/valid``.
         noise: standard deviation of the Gaussian action noise.
         seed: episode i of a task is the same in every collection with this seed.
-        workers: processes.
-        gains: of the experts.
-        stepper: of :class:`~torchrl_bmrl.envs.sawyer.SawyerEnv`; the episodes are the same.
-        after: by task, what the expert does before an episode of it begins
-            (:func:`collect_episode`); the episodes of a task take the entries in turn.
+        workers: number of processes.
+        gains: of the experts; ``None`` for their defaults.
+        after: by task, names of tasks whose experts act before an episode of it begins, joined by
+            ``-``, or ``""``; the episodes of a task take the entries in turn.
 
     Returns:
         the file of each task.
 
     Raises:
-        UnknownNameError: for a name that is not a task.
-        DataError: if a finished file holds another number of episodes than asked for.
-        StoppedError: if the run was asked to stop; the episodes that were finished are kept.
+        ConfigError: for a task without ``record``.
+        UnknownNameError: for a name in ``after`` that is not a task.
+        DataError: if a finished file has another number of episodes than asked for.
+        StoppedError: if the run was asked to stop; finished episodes are kept.
 
     Example:
         >>> import tempfile
         >>> files = collect_demonstrations(
         ...     Path(tempfile.mkdtemp()),
+        ...     [get_task("reach")],
         ...     {"reach": 1},
         ...     valid_episodes=1,
         ...     noise=0.2,
@@ -224,30 +110,37 @@ def collect_demonstrations(
         >>> files["reach"].name, count_episodes(files["reach"])
         ('reach.hdf5', 2)
     """
-    gains = gains or ExpertGains()
-    files = {check_task(task): directory / f"{task}.hdf5" for task in episodes}
-    afters = {task: list((after or {}).get(task, ())) or [""] for task in files}
-    counts = {task: number + valid_episodes for task, number in episodes.items()}
+    by_name = {task.name: task for task in tasks}
+    for task in tasks:
+        if task.record is None:
+            raise ConfigError(f"task {task.name} has no expert to record; valid: a task with one")
+    befores = {
+        name: [_parse_after(entry, by_name) for entry in (after or {}).get(name, ())] or [()]
+        for name in by_name
+    }
+    files = {name: directory / f"{name}.hdf5" for name in by_name}
+    counts = {name: episodes[name] + valid_episodes for name in by_name}
     parts = {
-        task: [directory / ".episodes" / task / f"{i:05d}.npz" for i in range(counts[task])]
-        for task in files
-        if not files[task].exists()
+        name: [directory / ".episodes" / name / f"{i:05d}.npz" for i in range(counts[name])]
+        for name, path in files.items()
+        if not path.exists()
     }
     jobs = [
         EpisodeJob(
-            task=task,
-            seed=derive_seed(seed, "collect", task, i),
+            task=by_name[name],
+            seed=derive_seed(seed, "collect", name, i),
             noise=noise,
             path=path,
             gains=gains,
-            stepper=stepper,
-            after=afters[task][i % len(afters[task])],
+            after=befores[name][i % len(befores[name])],
         )
-        for task in sorted(parts, key=TASKS.index)
-        for i, path in enumerate(parts[task])
+        for name, paths in parts.items()
+        for i, path in enumerate(paths)
         if not path.exists()
     ]
-    jobs.sort(key=lambda job: (TASKS.index(job.task), job.after))  # a worker keeps its last scene
+    # Equal scenes in a row: a worker keeps the last one that it built.
+    order = list(by_name)
+    jobs.sort(key=lambda job: (order.index(job.task.name), [task.name for task in job.after]))
     run_jobs(
         _collect_job,
         jobs,
@@ -256,25 +149,36 @@ def collect_demonstrations(
         description="collecting demonstrations",
         unit="episode",
     )
-    for task, paths in parts.items():
+    for name, paths in parts.items():
+        first = read_kept_episode(paths[0])
         write_episodes(
-            files[task],
-            (read_kept_episode(path) for path in paths),
+            files[name],
+            (_without_env_args(read_kept_episode(path)) for path in paths),
             masks={
-                "train": range(episodes[task]),
-                "valid": range(episodes[task], counts[task]),
+                "train": range(episodes[name]),
+                "valid": range(episodes[name], counts[name]),
             },
-            env_args=robosuite_metadata(task),
-            attributes={"task": task, "action_noise": noise, "seed": seed},
+            env_args=first.attributes.get(ENV_ARGS, {}),
+            attributes={"task": name, "action_noise": noise, "seed": seed},
         )
-        # Whole: a killed process may have left temporary files there.
-        shutil.rmtree(paths[0].parent)
-    for task, path in files.items():
-        if count_episodes(path) != counts[task]:
+        # The whole folder: a killed process may have left temporary files there.
+        shutil.rmtree(directory / ".episodes" / name)
+    for name, path in files.items():
+        if count_episodes(path) != counts[name]:
             raise DataError(
                 path,
                 "data",
-                f"holds {count_episodes(path)} episodes where {counts[task]} are asked for; "
+                f"holds {count_episodes(path)} episodes where {counts[name]} are asked for; "
                 "give another run_dir or remove the file",
             )
     return files
+
+
+def _parse_after(entry: str, by_name: Mapping[str, Task]) -> tuple[Task, ...]:
+    names = entry.split("-") if entry else []
+    return tuple(by_name[name] if name in by_name else get_task(name) for name in names)
+
+
+def _without_env_args(episode: Episode) -> Episode:
+    attributes = {key: value for key, value in episode.attributes.items() if key != ENV_ARGS}
+    return replace(episode, attributes=attributes)

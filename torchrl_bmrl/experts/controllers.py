@@ -1,26 +1,31 @@
-"""Scripted experts: proportional controllers that see the simulator's state.
+"""Scripted experts: proportional controllers that read the simulator's state.
 
-Each expert is a short list of named phases. Everything that decides an action, but for the phase,
-can be read off the policy's observation, so that the demonstrations can be learned from it.
+An expert goes through a few named phases. Apart from the phase, its actions depend only on what the
+policy's observation contains, so that a policy can learn them. Experts see poses and not joints:
+they control every arm.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from torchrl_bmrl.names import PUSH_DIRECTIONS, composition_stages
+from torchrl_bmrl.envs.skills import Lift, Push, Reach, Skill
+from torchrl_bmrl.errors import BMRLError
 
 if TYPE_CHECKING:
-    from torchrl_bmrl.envs.tasks import BMRLSawyerComposition, _BMRLSawyerTask
+    from torchrl_bmrl.envs.scene import TabletopScene
 
 POSITION_SCALE = 0.05
 """Metres that an action of 1 asks for."""
 ROTATION_SCALE = 0.5
 """Radians that an action of 1 asks for."""
 OPEN, CLOSE = -1.0, 1.0
+RELEASE_MARGIN = 0.003
+"""Fingers within this of their open gap have let go of the cube [m]."""
 
 
 @dataclass(kw_only=True)
@@ -28,17 +33,18 @@ class ExpertGains:
     """Gains and limits of the scripted experts.
 
     Attributes:
-        position: position error asked for in one action, as a multiple of the error.
-        grasp_position: the same for lifting. A stiff expert hardly ever leaves its line, and what
-            learns from it does not know the way back.
-        rotation: share of the rotation error asked for in one action.
-        speed_limit: largest position action of an expert in free motion, in (0, 1].
-        contact_speed_limit: largest position action when coming down on the cube and when
+        position: commanded position delta as a multiple of the position error.
+        grasp_position: the same while lifting. A stiff expert hardly ever leaves its line, and a
+            policy that imitates it does not learn the way back.
+        rotation: commanded rotation delta as a share of the rotation error.
+        speed_limit: largest position action in free motion, in (0, 1].
+        contact_speed_limit: largest position action while descending on the cube and while
             pushing it, in (0, 1]. At full speed the arm drifts sideways as it descends.
-        grasp_steps: steps given to the gripper to close; it needs 10 from fully open.
-        lift_height: height above its start that the cube is lifted to [m].
+        grasp_steps: smallest number of steps for closing; most grippers need 10 from fully open.
+        lift_height: height above its start to which the cube is lifted [m].
         push_line: distance from the table's centre along the direction to which the cube is
-            pushed [m]. A line and not a distance from the cube's start, which no policy sees.
+            pushed [m]. The policy does not observe the cube's start, so a distance from there
+            could not be learned.
 
     Example:
         >>> gains = ExpertGains(speed_limit=0.5)
@@ -57,32 +63,37 @@ class ExpertGains:
 
 
 class Expert:
-    """A scripted controller for one running robosuite environment.
+    """A scripted controller for one skill of a running scene.
 
     Subclasses define :attr:`phases` and :meth:`_target`.
 
     Args:
-        env: the robosuite environment to control.
-        gains: gains and limits.
+        env: the scene to control, after a reset.
+        gains: gains and limits; ``None`` for the defaults.
+
+    Attributes:
+        skill: the scene's skill at hand.
+        phase: index of the present phase in :attr:`phases`.
 
     Example:
-        >>> from torchrl_bmrl.envs.sawyer import SawyerEnv
+        >>> from torchrl_bmrl.envs.tabletop import TabletopEnv
         >>> class Up(Expert):
         ...     phases = ("up",)
         ...
         ...     def _target(self):
         ...         return self.env.eef_position + np.array([0.0, 0.0, 0.1]), OPEN, 1.0
-        >>> env = SawyerEnv("lift")
+        >>> env = TabletopEnv("lift")
         >>> observation, info = env.reset(seed=0)
-        >>> Up(env.robosuite_env, ExpertGains())().tolist()
+        >>> Up(env.robosuite_env)().tolist()
         [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0]
     """
 
     phases: ClassVar[tuple[str, ...]]
 
-    def __init__(self, env: _BMRLSawyerTask, gains: ExpertGains) -> None:
+    def __init__(self, env: TabletopScene, gains: ExpertGains | None = None) -> None:
         self.env = env
-        self.gains = gains
+        self.gains = gains or ExpertGains()
+        self.skill = env.skill
         self.reset()
 
     def reset(self) -> None:
@@ -113,11 +124,9 @@ class ReachExpert(Expert):
     phases = ("reach",)
 
     def reset(self) -> None:
-        """Starts over; keeps what the gripper does now."""
+        """Starts over; the gripper continues to open or to close."""
         super().reset()
-        # The first finger's command goes up while the gripper closes.
-        closing = self.env.robots[0].gripper["right"].current_action[0] > 0
-        self._gripper = CLOSE if closing else OPEN
+        self._gripper = CLOSE if self.env.gripper.closing else OPEN
 
     def _target(self) -> tuple[np.ndarray, float, float]:
         return self.env.goal, self._gripper, self.gains.speed_limit
@@ -148,7 +157,8 @@ class LiftExpert(Expert):
             return cube, OPEN, limit
         if self.phase == 1:
             self._closing += 1
-            if self._closing > self.gains.grasp_steps:
+            arrived = self.env.grasped or self.env.gripper.closed  # some grippers are slow
+            if self._closing > self.gains.grasp_steps and arrived:
                 self.phase = 2
             return cube, CLOSE, limit
         top = cube.copy()
@@ -162,45 +172,36 @@ class LiftExpert(Expert):
 class PushExpert(Expert):
     """Go beside the cube with the gripper closed, come down, push it over the line.
 
-    A cube that is in the hand is first brought down to the table and let go.
-
-    Args:
-        env: the robosuite environment to control.
-        gains: gains and limits.
-        direction: unit vector to push along, (3,).
+    A cube that is in the hand is first brought down to the table and released.
     """
 
     phases = ("approach", "contact", "push", "release")
     stand_off: ClassVar[float] = 0.055
     """Distance behind the cube's centre at which the gripper comes down [m]."""
 
-    def __init__(
-        self, env: _BMRLSawyerTask, gains: ExpertGains, direction: tuple[float, float, float]
-    ) -> None:
-        self._direction = np.array(direction)
-        super().__init__(env, gains)
+    skill: Push
 
     def reset(self) -> None:
-        """Starts over, by letting go of the cube if it is in the hand."""
+        """Starts over, first releasing the cube if it is in the hand."""
         super().reset()
         self.phase = 3 if self.env.grasped else 0
 
     def _release(self) -> tuple[np.ndarray, float, float] | None:
-        """Down to the table, open, and up again; ``None`` once the hand is clear of the cube."""
+        """Down to the table, open, up again; ``None`` once the hand is clear of the cube."""
         cube, eef = self.env.goal, self.env.eef_position
         limit = self.gains.contact_speed_limit
         height, up = cube[2] - self.env.goal_start[2], np.array([0.0, 0.0, 1.0])
         if self.env.grasped and height > 0.003:
             return eef - max(0.02, height) * up, CLOSE, limit
-        left, right = self.env.named_observation()["robot0_gripper_qpos"]
-        if left - right < 0.02 and eef[2] - cube[2] < 0.03:
+        around = self.env.gripper.gap < self.env.gripper.open_gap - RELEASE_MARGIN
+        if around and eef[2] - cube[2] < 0.03:
             return eef.copy(), OPEN, limit  # opens around the cube before it leaves
         if eef[2] - cube[2] < 0.06:
             return eef + 0.05 * up, OPEN, limit
         return None
 
     def _target(self) -> tuple[np.ndarray, float, float]:
-        cube, eef, along = self.env.goal, self.env.eef_position, self._direction
+        cube, eef, along = self.env.goal, self.env.eef_position, self.skill.direction
         behind = cube - self.stand_off * along
         offset = eef - behind
         height, horizontal = offset[2], np.linalg.norm(offset[:2])
@@ -233,23 +234,38 @@ class PushExpert(Expert):
         return cube + ahead * along, CLOSE, self.gains.contact_speed_limit
 
 
+EXPERTS: dict[type[Skill], type[Expert]] = {
+    Reach: ReachExpert,
+    Lift: LiftExpert,
+    Push: PushExpert,
+}
+"""Experts of this package's skills."""
+
+
 class ComposedExpert:
-    """The experts of a composition's tasks, each from where the one before it succeeded.
+    """The experts of a composition's skills, each from where the one before it succeeded.
 
     Args:
-        env: the robosuite environment to control.
-        gains: gains and limits.
+        env: the scene to control, after a reset.
+        experts: the class of each skill's expert.
+        gains: gains and limits; ``None`` for the defaults.
     """
 
-    def __init__(self, env: BMRLSawyerComposition, gains: ExpertGains | None = None) -> None:
+    def __init__(
+        self,
+        env: TabletopScene,
+        experts: Sequence[type[Expert]],
+        gains: ExpertGains | None = None,
+    ) -> None:
         self.env = env
+        self.experts = experts
         self.gains = gains
         self.reset()
 
     def reset(self) -> None:
-        """Starts over; call after every reset of the environment."""
-        self._stage = self.env.stage
-        self.expert = make_expert(self.env.task, self.env, self.gains)
+        """Starts over with the skill at hand; call after every reset of the environment."""
+        self._stage = min(self.env.stage, len(self.experts) - 1)
+        self.expert = self.experts[self._stage](self.env, self.gains)
 
     @property
     def phases(self) -> tuple[str, ...]:
@@ -263,42 +279,45 @@ class ComposedExpert:
 
     def __call__(self) -> np.ndarray:
         """Noise-free action (7,) in [-1, 1] for the environment's present state."""
-        if self.env.stage not in (self._stage, len(self.env.stages)):
+        if self.env.stage not in (self._stage, len(self.experts)):
             self.reset()
         return self.expert()
 
 
 def make_expert(
-    task: str, env: _BMRLSawyerTask, gains: ExpertGains | None = None
+    env: TabletopScene,
+    gains: ExpertGains | None = None,
+    *,
+    experts: Sequence[type[Expert]] | None = None,
 ) -> Expert | ComposedExpert:
-    """Scripted expert for a task's robosuite environment, or for a composition's.
+    """Scripted expert for a scene's skill, or for a composition's skills in turn.
 
     Args:
-        task: one of the six, or a composition: several joined by ``-``.
-        env: the robosuite environment of that task, after a reset.
+        env: the scene, after a reset.
         gains: gains and limits; ``None`` for the defaults.
+        experts: the class of each skill's expert; ``None`` for those of :data:`EXPERTS`.
 
     Returns:
-        what gives an action (7,) in [-1, 1] when it is called, for the environment's present state.
+        a callable that returns an action (7,) in [-1, 1] for the scene's present state.
 
     Raises:
-        UnknownNameError: for a name that is not a task.
+        BMRLError: if a skill has no expert in :data:`EXPERTS` and none is given.
 
     Example:
-        >>> from torchrl_bmrl.envs.sawyer import SawyerEnv
-        >>> env = SawyerEnv("lift")
+        >>> from torchrl_bmrl.envs.tabletop import TabletopEnv
+        >>> env = TabletopEnv("lift")
         >>> observation, info = env.reset(seed=0)
-        >>> expert = make_expert("lift", env.robosuite_env)
+        >>> expert = make_expert(env.robosuite_env)
         >>> for _ in range(5):
         ...     observation, *_ = env.step(expert())
         >>> expert.phases[expert.phase]
         'descend'
     """
-    gains = gains or ExpertGains()
-    if len(composition_stages(task)) > 1:
-        return ComposedExpert(env, gains)
-    if task == "reach":
-        return ReachExpert(env, gains)
-    if task == "lift":
-        return LiftExpert(env, gains)
-    return PushExpert(env, gains, PUSH_DIRECTIONS[task.removeprefix("push_")])
+    if experts is None:
+        for skill in env.skills:
+            if type(skill) not in EXPERTS:
+                raise BMRLError(f"skill {skill.name} has no expert; valid: one class in experts")
+        experts = [EXPERTS[type(skill)] for skill in env.skills]
+    if len(experts) > 1:
+        return ComposedExpert(env, experts, gains)
+    return experts[0](env, gains)

@@ -1,23 +1,34 @@
-"""The six Sawyer tasks, registered under their names."""
+"""Tasks of the tabletop scene: a skill, its expert, an arm.
+
+:func:`make_task` turns a :class:`~torchrl_bmrl.envs.skills.Skill` and the class of its
+:class:`~torchrl_bmrl.experts.controllers.Expert` into a :class:`~torchrl_bmrl.tasks.Task`.
+Importing this module registers the six tasks of the paper. The first episode loads the simulator.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, cast
 
-import torch
-from torchrl.data import Composite, Unbounded
-from torchrl.envs import EnvBase, GymEnv, GymWrapper
-from torchrl.envs.gym_like import default_info_dict_reader
-from torchrl.envs.transforms import CatTensors, Transform
+import numpy as np
 
 from torchrl_bmrl.data.episodes import Episode
-from torchrl_bmrl.data.schema import OBSERVATION_SHAPES
-from torchrl_bmrl.envs.transforms import SinCosTransform
+from torchrl_bmrl.envs.skills import SKILLS, Skill, SkillLike
+from torchrl_bmrl.errors import BMRLError, ConfigError
+from torchrl_bmrl.experts.controllers import EXPERTS, Expert, ExpertGains, make_expert
 from torchrl_bmrl.extras import needs
-from torchrl_bmrl.names import TASKS, composition_stages, gymnasium_id, horizon_of
+from torchrl_bmrl.run.workers import derive_seed
 from torchrl_bmrl.tasks import Task, register_task
 
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+    from torchrl.envs.transforms import Transform
+
+    from torchrl_bmrl.envs.tabletop import TabletopEnv
+
+STAGE_HORIZON = 100
+"""Steps that an episode of a composition has for each of its tasks."""
 OBSERVATION_PARTS = (
     "sin_joint_pos",
     "cos_joint_pos",
@@ -27,68 +38,266 @@ OBSERVATION_PARTS = (
     "robot0_eef_quat",
     "goal_pos",
 )
-"""Order of the parts in ``observation (33,)``: 7 + 7 + 2 + 7 + 3 + 4 + 3."""
+"""Order of the parts in ``observation``."""
+MAX_ATTEMPTS = 100
+"""Starts that are tried until the tasks before an episode succeed."""
 
 
-def make_observation() -> list[Transform]:
-    """Joint angles as sines and cosines, then all parts in one vector."""
+def make_task(
+    skill: Skill, expert: type[Expert], *, robot: str = "Sawyer", horizon: int = 200
+) -> Task:
+    """The task of one skill, to be registered with :func:`~torchrl_bmrl.tasks.register_task`.
+
+    Its options are ``skills``, ``robot``, ``gripper`` and ``stepper``, those of
+    :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`. Compositions have :data:`STAGE_HORIZON` steps
+    for each skill.
+
+    Args:
+        skill: start, goal, reward and success.
+        expert: class of the scripted expert that demonstrates the skill.
+        robot: the arm.
+        horizon: steps of an episode.
+
+    Example:
+        >>> from torchrl_bmrl.envs.skills import Lift
+        >>> from torchrl_bmrl.experts.controllers import LiftExpert
+        >>> task = make_task(Lift(), LiftExpert, robot="Panda")
+        >>> task.name, task.horizon, task.options["robot"]
+        ('lift', 200, 'Panda')
+    """
+    return _make_task(
+        [skill], [expert], {"robot": robot, "gripper": "default", "stepper": "fast"}, horizon
+    )
+
+
+def _make_task(
+    skills: Sequence[Skill], experts: Sequence[type[Expert]], options: dict[str, Any], horizon: int
+) -> Task:
+    return Task(
+        name="-".join(skill.name for skill in skills),
+        make_env=partial(make_tabletop_env, horizon=horizon),
+        record=partial(record_episode, experts=tuple(experts), horizon=horizon),
+        parts=("robot0_joint_pos", *OBSERVATION_PARTS[2:]),
+        observation=observation_transforms,
+        options={**options, "skills": tuple(skills)},
+        horizon=horizon,
+        success="success",
+        compose=compose_tasks,
+    )
+
+
+def compose_tasks(tasks: Sequence[Task]) -> Task:
+    """The task of several tasks of :func:`make_task` in a row, with the options of the first.
+
+    Args:
+        tasks: in their order; all with the same arm.
+
+    Raises:
+        ConfigError: if they have different arms.
+
+    Example:
+        >>> from torchrl_bmrl.tasks import get_task
+        >>> compose_tasks([get_task("reach"), get_task("lift")]).horizon
+        200
+    """
+    robots = {task.options["robot"] for task in tasks}
+    if len(robots) > 1:
+        names = ", ".join(task.name for task in tasks)
+        raise ConfigError(f"{names} have the arms {', '.join(sorted(robots))}; valid: one arm")
+    skills, experts = _chain(tasks)
+    return _make_task(skills, experts, dict(tasks[0].options), STAGE_HORIZON * len(skills))
+
+
+def _chain(tasks: Sequence[Task]) -> tuple[list[Skill], list[type[Expert]]]:
+    """Skills and experts of tasks in a row."""
+    skills = [skill for task in tasks for skill in task.options["skills"]]
+    records = [cast("partial[Episode]", task.record) for task in tasks]
+    return skills, [expert for record in records for expert in record.keywords["experts"]]
+
+
+def make_tabletop_env(
+    *,
+    skills: SkillLike | Sequence[SkillLike],
+    num_envs: int | None = None,
+    **options: Any,
+) -> EnvBase:
+    """TorchRL environment with the named parts of the observation.
+
+    ``success``, ``stage`` and each reward term, ``reward_<term>``, are read from ``info`` into the
+    tensordict.
+
+    Args:
+        skills: as for :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`.
+        num_envs: batch size ``[num_envs]``: episodes in one simulator, for a policy that acts in
+            all of them with one call; ``None`` for no batch dimension.
+        **options: of :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`.
+
+    Example:
+        >>> from torchrl_bmrl.envs.skills import Push
+        >>> env = make_tabletop_env(skills=[Push("up")], num_envs=2)
+        >>> env.rollout(3)["next", "goal_pos"].shape
+        torch.Size([2, 3, 3])
+    """
+    import torch
+    from torchrl.data import Composite, Unbounded
+    from torchrl.envs import GymWrapper
+    from torchrl.envs.gym_like import default_info_dict_reader
+
+    from torchrl_bmrl.envs.tabletop import TabletopEnv
+    from torchrl_bmrl.envs.vector import TabletopVectorEnv
+
+    made = (
+        TabletopEnv(skills, **options)
+        if num_envs is None
+        else TabletopVectorEnv(skills, num_envs, **options)
+    )
+    env = GymWrapper(made)
+    shape = env.batch_size
+    spec = Composite(
+        success=Unbounded(shape, dtype=torch.bool),
+        stage=Unbounded(shape, dtype=torch.int64),
+        **{f"reward_{name}": Unbounded(shape, dtype=torch.float64) for name in made.reward_terms},
+        shape=shape,
+    )
+    return env.set_info_dict_reader(default_info_dict_reader(list(spec.keys()), spec=spec))
+
+
+def observation_transforms() -> list[Transform]:
+    """Transforms from the named parts to ``observation``, for environments and stored data.
+
+    Joint positions become their sines and cosines. For an arm with n joints and a gripper with k,
+    ``observation`` has 3n + k + 10 numbers: 33 for Sawyer.
+    """
+    from torchrl.envs.transforms import CatTensors
+
+    from torchrl_bmrl.envs.transforms import SinCosTransform
+
     return [
         SinCosTransform("robot0_joint_pos", "sin_joint_pos", "cos_joint_pos"),
         CatTensors(list(OBSERVATION_PARTS), "observation", dim=-1, sort=False, del_keys=True),
     ]
 
 
-def make_tabletop_env(*, task: str, num_envs: int | None = None, **kwargs: Any) -> EnvBase:
-    """The environment of a task with its named parts."""
-    with needs("robosuite"):
-        import gymnasium
+_last: tuple[Any, TabletopEnv] | None = None
 
-    from torchrl_bmrl.envs.tasks import REWARD_TERMS
 
-    name = f"torchrl_bmrl.envs:{gymnasium_id(task)}"
-    if len(composition_stages(task)) > 1:  # these share one id
-        kwargs = {"task": task, "horizon": horizon_of(task)} | kwargs
-    env = (
-        GymEnv(name, **kwargs)
-        if num_envs is None
-        else GymWrapper(gymnasium.make_vec(name, num_envs, **kwargs))
+def _env(skills: tuple[Skill, ...], options: dict[str, Any]) -> TabletopEnv:
+    # Building the complete model takes a second: the last environment is kept.
+    global _last
+    key = skills, options
+    if _last is None or _last[0] != key:
+        with needs("robosuite"):
+            from torchrl_bmrl.envs.tabletop import TabletopEnv
+
+        if _last is not None:
+            _last[1].close()
+        _last = key, TabletopEnv(skills, **options)
+    return _last[1]
+
+
+def record_episode(
+    seed: int,
+    *,
+    skills: Sequence[Skill],
+    experts: Sequence[type[Expert]],
+    horizon: int,
+    noise: float,
+    gains: ExpertGains | None = None,
+    after: Sequence[Task] = (),
+    **options: Any,
+) -> Episode:
+    """One episode of the scripted expert, reproduced by ``seed``.
+
+    Args:
+        seed: decides start and noise.
+        skills: one, or several in a row.
+        experts: the class of each skill's expert.
+        horizon: steps of the episode.
+        noise: standard deviation of the Gaussian noise on each action dimension.
+        gains: of the experts; ``None`` for the defaults.
+        after: tasks whose experts act first. The episode begins where the last of them succeeded,
+            with arm, gripper and cube as they are then. Empty: where the skill itself begins.
+        **options: ``robot``, ``gripper`` and ``stepper`` of
+            :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`.
+
+    Returns:
+        the episode with the extras ``successes``, ``states`` and, for one skill, ``phases``, for a
+        composition ``stages``. The attribute ``env_args`` is robomimic's.
+
+    Raises:
+        BMRLError: if the experts of ``after`` fail in 100 starts.
+
+    Example:
+        >>> from torchrl_bmrl.tasks import get_task
+        >>> task = get_task("reach")
+        >>> episode = task.record(0, noise=0.2, **task.options)
+        >>> len(episode), bool(episode.extras["successes"].any())
+        (200, True)
+    """
+    from torchrl_bmrl.envs.robosuite_names import robosuite_metadata
+
+    before, experts_before = _chain(after)
+    env = _env((*before, *skills), options)
+    scene = env.robosuite_env
+    rng = np.random.default_rng(derive_seed(seed, "action noise"))
+
+    def act() -> np.ndarray:
+        # Rounded to float32 first: the executed action is the stored one to the bit.
+        return np.clip(expert() + noise * rng.standard_normal(7), -1.0, 1.0).astype(np.float32)
+
+    for attempt in range(MAX_ATTEMPTS):
+        observation, _ = env.reset(seed=derive_seed(seed, "again", attempt) if attempt else seed)
+        expert = make_expert(scene, gains, experts=[*experts_before, *experts])
+        while scene.stage < len(before) and scene.timestep < STAGE_HORIZON * len(before):
+            observation, *_ = env.step(act())
+        if scene.stage == len(before):
+            break
+    else:
+        raise BMRLError(
+            f"the experts of {'-'.join(skill.name for skill in before)} failed in {MAX_ATTEMPTS} "
+            "starts; valid in after: tasks that they solve"
+        )
+    observations = {name: [part] for name, part in observation.items()}
+    model_file = scene.scene_xml()
+    actions, rewards, successes, phases, states, stages = [], [], [], [], [], []
+    for _ in range(horizon):
+        action = act()
+        phases.append(expert.phase)
+        states.append(scene.sim.get_state().flatten())
+        stages.append(scene.stage - len(before))
+        observation, reward, _, _, info = env.step(action)
+        for name, part in observation.items():
+            observations[name].append(part)
+        actions.append(action)
+        rewards.append(reward)
+        successes.append(scene.skill_success() if before else info["success"])
+    parts = {name: np.stack(rows) for name, rows in observations.items()}
+    # The phases of a composition's experts have no names in common; its stages are stored instead.
+    alone = len(skills) == 1
+    return Episode(
+        observations={name: part[:-1] for name, part in parts.items()},
+        next_observations={name: part[1:] for name, part in parts.items()},
+        actions=np.stack(actions),
+        rewards=np.array(rewards),
+        terminated=np.zeros(len(actions), dtype=bool),
+        extras={
+            "successes": np.array(successes),
+            **({"phases": np.array(phases, dtype=np.int8)} if alone else {}),
+            "states": np.stack(states),
+            **({} if alone else {"stages": np.array(stages, dtype=np.int8)}),
+        },
+        # robomimic plays states back in the model of the demonstration.
+        attributes={
+            "seed": seed,
+            **({"phase_names": list(expert.phases)} if alone else {}),
+            "model_file": model_file,
+            **({"after": "-".join(skill.name for skill in before)} if before else {}),
+            "env_args": robosuite_metadata(
+                skills, options.get("robot", "Sawyer"), options.get("gripper", "default")
+            ),
+        },
     )
-    shape = env.batch_size
-    keys = ["success", "stage", *(f"reward_{name}" for name in REWARD_TERMS)]
-    spec = Composite(
-        success=Unbounded(shape, dtype=torch.bool),
-        stage=Unbounded(shape, dtype=torch.int64),
-        **{key: Unbounded(shape, dtype=torch.float64) for key in keys[2:]},
-        shape=shape,
-    )
-    env.set_info_dict_reader(default_info_dict_reader(keys, spec=spec))
-    return env
 
 
-def record_episode(seed: int, *, task: str, **options: Any) -> Episode:
-    """An episode of the scripted expert."""
-    from torchrl_bmrl.experts.collect import collect_episode
-
-    return collect_episode(task, seed, **options)
-
-
-def _make_task(names: str) -> Task:
-    return Task(
-        name=names,
-        make_env=make_tabletop_env,
-        record=record_episode,
-        parts=tuple(OBSERVATION_SHAPES),
-        observation=make_observation,
-        options={"task": names, "stepper": "fast"},
-        horizon=horizon_of(names),
-        success="success",
-        compose=_compose,
-    )
-
-
-def _compose(tasks: Sequence[Task]) -> Task:
-    return _make_task("-".join(task.name for task in tasks))
-
-
-for _name in TASKS:
-    register_task(_make_task(_name))
+for _skill in SKILLS.values():
+    register_task(make_task(_skill, EXPERTS[type(_skill)]))

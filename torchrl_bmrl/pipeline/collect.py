@@ -33,6 +33,7 @@ def collect(run: Run) -> None:
     if recorded:
         collect_demonstrations(
             run.data_dir,
+            recorded,
             settings.train_episodes,
             valid_episodes=settings.valid_episodes,
             noise=settings.noise,
@@ -40,7 +41,6 @@ def collect(run: Run) -> None:
             seed=run.settings.seed,
             workers=run.settings.workers,
             after=settings.after,
-            stepper=run.settings.stepper,
         )
     _import_files(run)
     statistics = write_statistics(run.data_dir, run.tasks)

@@ -13,10 +13,9 @@ pytest.importorskip("robosuite", exc_type=ImportError)
 import torch
 
 import torchrl_bmrl.envs  # registers the ids  # noqa: F401
-from torchrl_bmrl.envs.sawyer import SawyerEnv
+from torchrl_bmrl.envs.tabletop import STEPPERS, TabletopEnv
 from torchrl_bmrl.envs.transforms import make_env
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.names import STEPPERS
 
 pytestmark = pytest.mark.robosuite
 
@@ -26,14 +25,14 @@ ACTIONS[:, 6] = np.sign(np.sin(np.arange(60)))  # the gripper is never at rest
 
 
 @pytest.fixture(scope="module")
-def envs() -> Iterator[dict[str, SawyerEnv]]:
-    made = {task: SawyerEnv(task) for task in ("reach", "lift", "push_left")}
+def envs() -> Iterator[dict[str, TabletopEnv]]:
+    made = {task: TabletopEnv(task) for task in ("reach", "lift", "push_left")}
     yield made
     for env in made.values():
         env.close()
 
 
-def rows(env: SawyerEnv, actions: np.ndarray) -> np.ndarray:
+def rows(env: TabletopEnv, actions: np.ndarray) -> np.ndarray:
     """Everything that steps show, and where they lead."""
     seen = []
     for action in actions:
@@ -48,7 +47,7 @@ def rows(env: SawyerEnv, actions: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("stepper", STEPPERS)
 @pytest.mark.parametrize("task", ["reach", "lift", "push_left"])
 def test_restoring_equals_never_having_left(task: str, stepper: str, steps: int) -> None:
-    env, other = (SawyerEnv(task, stepper=stepper) for _ in range(2))
+    env, other = (TabletopEnv(task, stepper=stepper) for _ in range(2))
     env.reset(seed=1)
     rows(env, ACTIONS[:steps])
     state = env.get_state()
@@ -66,7 +65,7 @@ def test_restoring_equals_never_having_left(task: str, stepper: str, steps: int)
 def test_a_state_comes_back_from_a_file_with_observation_time_limit_and_next_start(
     tmp_path: Path,
 ) -> None:
-    env = SawyerEnv("push_left", horizon=12)
+    env = TabletopEnv("push_left", horizon=12)
     env.reset(seed=5)
     for action in ACTIONS[:10]:
         observation, _, _, truncated, info = env.step(action)
@@ -74,7 +73,7 @@ def test_a_state_comes_back_from_a_file_with_observation_time_limit_and_next_sta
     np.savez(tmp_path / "state.npz", **env.get_state())
     rest = [env.step(action) for action in ACTIONS[10:12]]
     following, _ = env.reset()
-    fresh = SawyerEnv("push_left", horizon=12)
+    fresh = TabletopEnv("push_left", horizon=12)
     with np.load(tmp_path / "state.npz") as state:
         shown, shown_info = fresh.reset(options={"state": state})
     for name, part in observation.items():
@@ -88,7 +87,7 @@ def test_a_state_comes_back_from_a_file_with_observation_time_limit_and_next_sta
 
 
 def test_a_state_of_one_task_goes_on_in_another_with_its_rewards(
-    envs: dict[str, SawyerEnv],
+    envs: dict[str, TabletopEnv],
 ) -> None:
     lift, push = envs["lift"], envs["push_left"]
     lift.reset(seed=2)
@@ -111,7 +110,9 @@ BAD = {
 
 
 @pytest.mark.parametrize("fault", BAD)
-def test_a_bad_state_is_refused_and_changes_nothing(envs: dict[str, SawyerEnv], fault: str) -> None:
+def test_a_bad_state_is_refused_and_changes_nothing(
+    envs: dict[str, TabletopEnv], fault: str
+) -> None:
     env = envs["lift"]
     env.reset(seed=0)
     state = env.get_state()
@@ -125,7 +126,7 @@ def test_a_bad_state_is_refused_and_changes_nothing(envs: dict[str, SawyerEnv], 
         np.testing.assert_array_equal(part, now[key])
 
 
-def test_a_reach_state_does_not_fit_a_task_with_a_cube(envs: dict[str, SawyerEnv]) -> None:
+def test_a_reach_state_does_not_fit_a_task_with_a_cube(envs: dict[str, TabletopEnv]) -> None:
     envs["reach"].reset(seed=0)
     with pytest.raises(BMRLError, match=r"physics.*lift"):
         envs["lift"].set_state(envs["reach"].get_state())

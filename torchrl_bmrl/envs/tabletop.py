@@ -1,68 +1,75 @@
-"""The Sawyer tasks as a gymnasium environment, with exact saving and restoring of its state."""
+"""The tabletop scene as a gymnasium environment whose state can be saved and restored exactly."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from torchrl_bmrl.envs.rendering import graphics_library, make_renderer
+from torchrl_bmrl.envs.scene import CONTROL_FREQUENCY, TabletopScene
+from torchrl_bmrl.envs.skills import REWARD_TERMS, SkillLike
 from torchrl_bmrl.envs.stepper import FastStepper
-from torchrl_bmrl.envs.tasks import CONTROL_FREQUENCY, REWARD_TERMS, make_robosuite_env
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.extras import needs
-from torchrl_bmrl.names import STEPPERS
 
 with needs("robosuite"):
     import gymnasium
     import mujoco
 
+STEPPERS = ("fast", "robosuite")
+"""What advances the simulator; both give the same trajectories to the bit."""
+
 _PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION
-_said: set[str] = set()
+_warned: set[str] = set()
 
 
-class SawyerEnv(gymnasium.Env):
-    """One Sawyer task as a gymnasium environment.
+class TabletopEnv(gymnasium.Env):
+    """One skill, or several in a row, with one arm at a table.
 
-    Observation: a dict of named parts under robosuite's names, float64: ``robot0_joint_pos`` (7,)
-    [rad], ``robot0_gripper_qpos`` (2,) [m], ``robot0_joint_vel`` (7,) [rad/s], ``robot0_eef_pos``
-    (3,) [m], ``robot0_eef_quat`` (4,) xyzw, ``goal_pos`` (3,) [m].
+    The observation is a dict of named parts under robosuite's names, float64, for an arm with n
+    joints and a gripper with k: ``robot0_joint_pos`` (n,) [rad], ``robot0_gripper_qpos`` (k,) [m]
+    or [rad], ``robot0_joint_vel`` (n,) [rad/s], ``robot0_eef_pos`` (3,) [m], ``robot0_eef_quat``
+    (4,) xyzw, ``goal_pos`` (3,) [m]. Sawyer has n = 7 and k = 2.
 
-    Action: (7,) in [-1, 1]: position delta (x0.05 m), rotation delta (x0.5 rad), gripper (+1
+    The action is (7,) in [-1, 1]: position delta (x0.05 m), rotation delta (x0.5 rad), gripper (+1
     closes, -1 opens).
 
-    ``info``: ``success``, each reward term as ``reward_<term>`` and ``stage``, the number of the
-    composition's tasks that are done (0 in a task alone).
+    ``info`` contains ``success``, each reward term as ``reward_<term>`` (0 for terms of other
+    skills) and ``stage``, the number of the composition's skills that are done (0 for one skill).
 
-    In a composition the goal is that of the task at hand, and so is the reward; ``success`` holds
-    from the step on at which the last task succeeds.
+    In a composition goal and reward are those of the skill at hand. ``success`` holds from the step
+    on at which the last skill succeeds.
 
-    An episode never terminates; the registered ids are truncated after 200 steps, compositions
-    after 100 for each of their tasks.
+    An episode never terminates. The registered ids are truncated after 200 steps, compositions
+    after 100 for each skill.
 
     Args:
-        task: one of :data:`torchrl_bmrl.names.TASKS`, or a composition: several joined by ``-``,
-            such as ``"reach-lift-reach"``.
+        skills: a :class:`~torchrl_bmrl.envs.skills.Skill`, several in a row, or names of
+            :data:`~torchrl_bmrl.envs.skills.SKILLS` joined by ``-``, such as ``"reach-lift"``.
         render_mode: ``None`` or ``"rgb_array"``, which needs no display
             (:func:`torchrl_bmrl.envs.rendering.graphics_library`).
         camera: robosuite camera for :meth:`render`.
         image_size: height and width of the rendered picture [pixels].
-        stepper: ``"fast"``, compiled code that gives robosuite's trajectories bit by bit, or
-            ``"robosuite"``. A controller that the first does not cover is left to robosuite, which
-            a warning says once.
-        controller_configs: robosuite's composite controller; by default Sawyer's operational-space
-            control of the pose.
-        horizon: an episode is truncated after so many steps; ``None`` never. (Not gymnasium's
-            ``max_episode_steps``, whose count starts anew when a state is restored.)
+        robot: the arm, one of :data:`torchrl_bmrl.envs.arms.ARMS`.
+        gripper: robosuite's name of a gripper, or ``"default"`` for the one that robosuite gives
+            the arm.
+        stepper: ``"fast"``, compiled code that computes robosuite's trajectories bit by bit, or
+            ``"robosuite"``. A controller that the compiled code does not cover is advanced by
+            robosuite; a warning says so once.
+        controller_configs: robosuite's composite controller; by default the arm's
+            operational-space control of the pose.
+        horizon: steps after which an episode is truncated; ``None`` for no limit. (gymnasium's
+            ``max_episode_steps`` would count anew when a state is restored.)
 
     Raises:
-        UnknownNameError: for another task, render mode or stepper.
+        UnknownNameError: for an unknown skill, arm, render mode or stepper.
         RenderError: for ``render_mode="rgb_array"`` where no graphics library works.
 
     Example:
-        >>> env = SawyerEnv("lift")
+        >>> env = TabletopEnv("lift")
         >>> observation, info = env.reset(seed=0)
         >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
         >>> terminated, bool(info["success"])
@@ -76,11 +83,13 @@ class SawyerEnv(gymnasium.Env):
 
     def __init__(
         self,
-        task: str,
+        skills: SkillLike | Sequence[SkillLike],
         render_mode: str | None = None,
         camera: str = "frontview",
         image_size: tuple[int, int] = (256, 256),
         *,
+        robot: str = "Sawyer",
+        gripper: str = "default",
         stepper: str = "fast",
         controller_configs: dict[str, Any] | None = None,
         horizon: int | None = None,
@@ -91,7 +100,6 @@ class SawyerEnv(gymnasium.Env):
             raise UnknownNameError("stepper", stepper, STEPPERS)
         if render_mode is not None:
             graphics_library()  # not only at the first picture
-        self.task = task
         self.render_mode = render_mode
         self.camera = camera
         self.image_size = image_size
@@ -99,10 +107,19 @@ class SawyerEnv(gymnasium.Env):
         self.horizon = horizon
         self._fast: FastStepper | None = None
         self._picture: tuple[mujoco.MjModel, mujoco.MjData, mujoco.Renderer] | None = None
-        options = {} if controller_configs is None else {"controller_configs": controller_configs}
-        self.robosuite_env = make_robosuite_env(
-            task, use_object_obs=False, lean=stepper == "fast", **options
+        options: dict[str, Any] = (
+            {} if controller_configs is None else {"controller_configs": controller_configs}
         )
+        self.robosuite_env = TabletopScene(
+            skills,
+            robots=robot,
+            gripper_types=gripper,
+            use_object_obs=False,
+            lean=stepper == "fast",
+            **options,
+        )
+        own = (term for skill in self.robosuite_env.skills for term in skill.terms)
+        self.reward_terms = tuple(dict.fromkeys((*REWARD_TERMS, *own)))
         low, high = self.robosuite_env.action_spec
         self.action_space = gymnasium.spaces.Box(
             low.astype(np.float32), high.astype(np.float32), dtype=np.float32
@@ -114,12 +131,17 @@ class SawyerEnv(gymnasium.Env):
             }
         )
 
+    @property
+    def task(self) -> str:
+        """Names of the skills, joined by ``-``."""
+        return "-".join(skill.name for skill in self.robosuite_env.skills)
+
     def _info(self, terms: dict[str, float]) -> dict[str, Any]:
-        # numpy scalars: TorchRL's info reader asks every value for its dtype.
+        # TorchRL's info reader asks every value for its dtype.
         return {
             "success": np.bool_(self.robosuite_env._check_success()),
             "stage": np.int64(self.robosuite_env.stage),
-            **{f"reward_{name}": np.float64(terms.get(name, 0.0)) for name in REWARD_TERMS},
+            **{f"reward_{name}": np.float64(terms.get(name, 0.0)) for name in self.reward_terms},
         }
 
     def reset(
@@ -128,18 +150,18 @@ class SawyerEnv(gymnasium.Env):
         """Starts an episode; the same ``seed`` gives the same episode.
 
         Args:
-            seed: of the start and of later unseeded ones.
-            options: ``{"state": state}`` goes on from a state of :meth:`get_state` instead.
+            seed: of this start and of later unseeded ones.
+            options: ``{"state": state}`` continues from a state of :meth:`get_state` instead.
 
         Raises:
-            BMRLError: as :meth:`set_state`.
+            BMRLError: see :meth:`set_state`.
         """
         super().reset(seed=seed)
         if options and "state" in options:
-            self.set_state(options["state"])  # its random numbers come along, whatever the seed
+            self.set_state(options["state"])  # includes the random numbers: the seed has no effect
         else:
             if seed is not None:
-                # In place: assigning robosuite's rng would not reach the samplers that hold it.
+                # In place: robosuite's samplers hold a reference to this generator.
                 state = np.random.default_rng(seed).bit_generator.state
                 self.robosuite_env.rng.bit_generator.state = state
             self.robosuite_env.reset()
@@ -151,7 +173,7 @@ class SawyerEnv(gymnasium.Env):
         """Acts for one control period (50 ms).
 
         Raises:
-            BMRLError: if the action has another shape or is not finite; nothing has moved then.
+            BMRLError: if the action has another shape or is not finite; nothing moves then.
         """
         action = np.asarray(action, dtype=np.float64)
         shape = self.action_space.shape
@@ -170,8 +192,8 @@ class SawyerEnv(gymnasium.Env):
             try:
                 self._fast = FastStepper(env)
             except BMRLError as error:
-                if str(error) not in _said:
-                    _said.add(str(error))
+                if str(error) not in _warned:
+                    _warned.add(str(error))
                     warnings.warn(f"steps are robosuite's own, and slow: {error}", stacklevel=3)
         if self._fast is None:
             env.step(action)
@@ -184,14 +206,14 @@ class SawyerEnv(gymnasium.Env):
     # -- state ---------------------------------------------------------------------------------
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """Everything that decides how the episode goes on, at any step, as arrays.
+        """The complete state of the episode and of the random numbers, as arrays.
 
         ``physics``: MuJoCo's integration state (positions, velocities, warm start, controls, time);
-        ``gripper`` and ``rest_joints``: what robosuite's gripper and arm controllers remember;
-        ``goal_start``; in compositions ``stage`` and ``targets``; ``steps`` taken; ``rng``: of the
-        starts to come. ``np.savez`` keeps it.
+        ``gripper`` and ``rest_joints``: the memory of robosuite's gripper and arm controllers;
+        ``goal_start``; in compositions ``stage`` and ``targets``; ``steps`` taken; ``rng`` of the
+        starts to come. ``np.savez`` can save it.
 
-        Exact for Sawyer's own controller and every other that does not interpolate goals.
+        It is exact for the arms' default controllers and all others that do not interpolate goals.
         """
         env, robot = self.robosuite_env, self.robosuite_env.robots[0]
         model, data = env.sim.model._model, env.sim.data._data
@@ -208,14 +230,14 @@ class SawyerEnv(gymnasium.Env):
         }
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Goes back to a state of :meth:`get_state`, of this environment or of another one.
+        """Restores a state of :meth:`get_state`, of this environment or of another one.
 
-        What follows equals never having left, in the task at hand: states of lift and of the four
-        pushes can be exchanged.
+        The episode continues as if it had never been interrupted, with this environment's skill:
+        states of lift and of the four pushes can be exchanged.
 
         Raises:
-            BMRLError: if an array is missing, too many, of another shape or not finite; nothing has
-                changed then.
+            BMRLError: if an array is missing, unknown, of another shape or not finite; nothing
+                changes then.
         """
         now = self.get_state()
         if state.keys() != now.keys():
@@ -236,13 +258,13 @@ class SawyerEnv(gymnasium.Env):
         env.rng.bit_generator.state = _rng_from_array(arrays["rng"])
 
     def _load_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """The state, but neither the poses that follow from it nor the random numbers to come."""
+        """Restores a state without the poses that follow from it and without random numbers."""
         env, robot = self.robosuite_env, self.robosuite_env.robots[0]
         mujoco.mj_setState(env.sim.model._model, env.sim.data._data, state["physics"], _PHYSICS)
         robot.gripper["right"].current_action = state["gripper"].copy()
         arm = robot.composite_controller.part_controllers["right"]
         arm.initial_joint = state["rest_joints"].copy()
-        # Otherwise robosuite goes on from the pose that it saw last.
+        # Otherwise robosuite continues from the pose that it read last.
         arm.new_update = True
         env.set_episode_state(state)
         env.timestep = int(state["steps"][0])
@@ -261,7 +283,7 @@ class SawyerEnv(gymnasium.Env):
     def _draw(self) -> np.ndarray:
         env = self.robosuite_env
         if self._picture is None:
-            # A model of its own, complete: the one that is simulated has no pictures.
+            # The simulated model may lack what cameras see.
             model = mujoco.MjModel.from_xml_string(env.scene_xml())
             self._picture = model, mujoco.MjData(model), make_renderer(model, *self.image_size)
         model, data, renderer = self._picture
@@ -290,7 +312,7 @@ def _rng_to_array(rng: np.random.Generator) -> np.ndarray:
 
 
 def _rng_from_array(array: np.ndarray) -> dict[str, Any]:
-    """What :func:`_rng_to_array` was made from."""
+    """The state that :func:`_rng_to_array` turned into an array."""
     words = [int(word) for word in array]
     return {
         "bit_generator": "PCG64",

@@ -1,4 +1,4 @@
-"""The six Sawyer tasks: starts, rewards, success, episodes, interfaces."""
+"""The six tasks on the tabletop: starts, rewards, success, episodes, interfaces."""
 
 from __future__ import annotations
 
@@ -20,25 +20,28 @@ from gymnasium.utils.env_checker import check_env
 from torchrl.envs.utils import check_env_specs
 
 import torchrl_bmrl.envs  # registers the ids  # noqa: F401
-from torchrl_bmrl.envs.sawyer import SawyerEnv
-from torchrl_bmrl.envs.tasks import (
+from torchrl_bmrl.envs.arms import inverse_kinematics
+from torchrl_bmrl.envs.registration import gymnasium_id
+from torchrl_bmrl.envs.robosuite_names import robosuite_metadata
+from torchrl_bmrl.envs.scene import (
     CUBE_HALF_SIZE,
     CUBE_RANGE,
+    HOME,
     HOVER_HEIGHT,
-    REACH_GOAL_HIGH,
-    REACH_GOAL_LOW,
-    REACH_START,
-    REWARD_TERMS,
     TABLE_TOP,
-    make_robosuite_env,
-    robosuite_metadata,
+    TARGET_HIGH,
+    TARGET_LOW,
+    TabletopScene,
 )
+from torchrl_bmrl.envs.skills import REWARD_TERMS, SKILLS
+from torchrl_bmrl.envs.tabletop import TabletopEnv
 from torchrl_bmrl.envs.transforms import make_env
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.experts.controllers import make_expert
-from torchrl_bmrl.names import TASKS, gymnasium_id
 
 pytestmark = pytest.mark.robosuite
+
+TASKS = tuple(SKILLS)
 
 CUBE_TASKS = [task for task in TASKS if task != "reach"]
 PUSH_TASKS = [task for task in TASKS if task.startswith("push")]
@@ -68,32 +71,32 @@ ZERO = np.zeros(7, dtype=np.float32)
 
 
 @pytest.fixture(scope="module")
-def envs() -> Iterator[dict[str, SawyerEnv]]:
-    made = {task: SawyerEnv(task) for task in TASKS}
+def envs() -> Iterator[dict[str, TabletopEnv]]:
+    made = {task: TabletopEnv(task) for task in TASKS}
     yield made
     for env in made.values():
         env.close()
 
 
-def simulator(env: SawyerEnv) -> tuple[Any, Any]:
+def simulator(env: TabletopEnv) -> tuple[Any, Any]:
     """MuJoCo's own model and data, below the code under test."""
     sim = env.robosuite_env.sim
     return sim.model._model, sim.data._data
 
 
-def eef(env: SawyerEnv) -> np.ndarray:
+def eef(env: TabletopEnv) -> np.ndarray:
     return simulator(env)[1].site("gripper0_right_grip_site").xpos.copy()
 
 
-def cube(env: SawyerEnv) -> np.ndarray:
+def cube(env: TabletopEnv) -> np.ndarray:
     return simulator(env)[1].body("cube_main").xpos.copy()
 
 
-def cube_velocity(env: SawyerEnv) -> np.ndarray:
+def cube_velocity(env: TabletopEnv) -> np.ndarray:
     return simulator(env)[1].joint("cube_joint0").qvel[:3].copy()
 
 
-def touches(env: SawyerEnv) -> set[str]:
+def touches(env: TabletopEnv) -> set[str]:
     """Fingers ("l", "r") in contact with the cube."""
     model, data = simulator(env)
     found = set()
@@ -104,24 +107,24 @@ def touches(env: SawyerEnv) -> set[str]:
     return found
 
 
-def place_cube(env: SawyerEnv, position: np.ndarray) -> None:
+def place_cube(env: TabletopEnv, position: np.ndarray) -> None:
     _, data = simulator(env)
     data.joint("cube_joint0").qpos[:] = [*position, 1.0, 0.0, 0.0, 0.0]
     env.robosuite_env.sim.forward()
 
 
-def place_fingers(env: SawyerEnv, opening: float) -> None:
+def place_fingers(env: TabletopEnv, opening: float) -> None:
     _, data = simulator(env)
     data.joint("gripper0_right_l_finger_joint").qpos[:] = opening
     data.joint("gripper0_right_r_finger_joint").qpos[:] = -opening
     env.robosuite_env.sim.forward()
 
 
-def success(env: SawyerEnv) -> bool:
+def success(env: TabletopEnv) -> bool:
     return env.robosuite_env._check_success()
 
 
-def episode(env: SawyerEnv, seed: int, actions: np.ndarray) -> np.ndarray:
+def episode(env: TabletopEnv, seed: int, actions: np.ndarray) -> np.ndarray:
     """Everything that an episode shows, row by row: reward, observation, info."""
     observation, info = env.reset(seed=seed)
     rows = [[0.0, *np.concatenate([*observation.values()]), *map(float, info.values())]]
@@ -194,7 +197,7 @@ def test_success_and_reward_terms_reach_the_tensordict(task: str) -> None:
     assert (after["reward_reach"] > 0).all()
 
 
-def test_observation_is_a_dict_of_named_parts(envs: dict[str, SawyerEnv]) -> None:
+def test_observation_is_a_dict_of_named_parts(envs: dict[str, TabletopEnv]) -> None:
     for env in envs.values():
         observation, _ = env.reset(seed=0)
         assert {name: part.shape for name, part in observation.items()} == {
@@ -205,7 +208,7 @@ def test_observation_is_a_dict_of_named_parts(envs: dict[str, SawyerEnv]) -> Non
 
 @pytest.mark.parametrize("task", ["reach", "push_up"])
 def test_parts_are_robosuites_observables_of_the_same_names(task: str) -> None:
-    env = make_robosuite_env(task, seed=4)
+    env = TabletopScene(task, seed=4)
     theirs, ours = env.reset(), env.named_observation()
     env.close()
     for name in PARTS:
@@ -213,7 +216,7 @@ def test_parts_are_robosuites_observables_of_the_same_names(task: str) -> None:
 
 
 def test_observation_has_the_33_numbers_in_the_documented_order(
-    envs: dict[str, SawyerEnv],
+    envs: dict[str, TabletopEnv],
 ) -> None:
     torchrl_env, env = make_env("lift"), envs["lift"]
     data = torchrl_env.reset(seed=11)
@@ -248,7 +251,7 @@ def test_robosuite_rebuilds_a_task_from_the_metadata_of_a_dataset() -> None:
         env = robosuite.make(metadata["env_name"], **metadata["env_kwargs"])
         assert type(env).__name__ == metadata["env_name"]
         if task == "push_right":
-            np.testing.assert_array_equal(env.direction, DIRECTIONS[task])
+            np.testing.assert_array_equal(env.skill.direction, DIRECTIONS[task])
         env.close()
 
 
@@ -256,7 +259,7 @@ def test_robosuite_rebuilds_a_task_from_the_metadata_of_a_dataset() -> None:
 
 
 @pytest.mark.parametrize("task", ["reach", "lift", "push_left"])
-def test_a_seed_reproduces_an_episode_exactly(envs: dict[str, SawyerEnv], task: str) -> None:
+def test_a_seed_reproduces_an_episode_exactly(envs: dict[str, TabletopEnv], task: str) -> None:
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1, 1, (30, 7)).astype(np.float32)
     first = episode(envs[task], 5, actions)
@@ -264,13 +267,15 @@ def test_a_seed_reproduces_an_episode_exactly(envs: dict[str, SawyerEnv], task: 
     np.testing.assert_array_equal(episode(envs[task], 5, actions), first)
     episode(envs[task], 6, rng.uniform(-1, 1, (17, 7)).astype(np.float32))
     np.testing.assert_array_equal(episode(envs[task], 5, actions), first)
-    fresh = SawyerEnv(task)
+    fresh = TabletopEnv(task)
     np.testing.assert_array_equal(episode(fresh, 5, actions), first)
     fresh.close()
 
 
 @pytest.mark.parametrize("task", ["reach", "lift"])
-def test_seeds_and_unseeded_resets_start_differently(envs: dict[str, SawyerEnv], task: str) -> None:
+def test_seeds_and_unseeded_resets_start_differently(
+    envs: dict[str, TabletopEnv], task: str
+) -> None:
     env = envs[task]
     starts = [env.reset(seed=seed)[0] for seed in (0, 1)] + [env.reset()[0] for _ in range(2)]
     goals = np.stack([start["goal_pos"] for start in starts])
@@ -278,23 +283,23 @@ def test_seeds_and_unseeded_resets_start_differently(envs: dict[str, SawyerEnv],
 
 
 def test_the_end_effector_of_reach_starts_within_1_cm_of_the_set_point(
-    envs: dict[str, SawyerEnv],
+    envs: dict[str, TabletopEnv],
 ) -> None:
     starts, goals = [], []
     for seed in range(20):
         observation, _ = envs["reach"].reset(seed=seed)
         starts.append(eef(envs["reach"]))
         goals.append(observation["goal_pos"])
-    distances = np.linalg.norm(np.array(starts) - REACH_START, axis=1)
+    distances = np.linalg.norm(np.array(starts) - HOME, axis=1)
     assert distances.max() <= 0.01 + 1e-4
     assert distances.max() > 0.005  # a point for all of them would be another task
-    assert (np.array(goals) >= REACH_GOAL_LOW).all()
-    assert (np.array(goals) <= REACH_GOAL_HIGH).all()
+    assert (np.array(goals) >= TARGET_LOW).all()
+    assert (np.array(goals) <= TARGET_HIGH).all()
     assert (np.std(goals, axis=0) > 0.03).all()
 
 
 @pytest.mark.parametrize("task", CUBE_TASKS)
-def test_the_gripper_starts_above_a_cube_at_rest(envs: dict[str, SawyerEnv], task: str) -> None:
+def test_the_gripper_starts_above_a_cube_at_rest(envs: dict[str, TabletopEnv], task: str) -> None:
     env = envs[task]
     places = []
     for seed in range(10):
@@ -314,7 +319,7 @@ def test_the_gripper_starts_above_a_cube_at_rest(envs: dict[str, SawyerEnv], tas
 
 @pytest.mark.parametrize("task", TASKS)
 def test_a_zero_action_holds_the_start_whatever_was_done_before(
-    envs: dict[str, SawyerEnv], task: str
+    envs: dict[str, TabletopEnv], task: str
 ) -> None:
     env = envs[task]
     env.reset(seed=1)
@@ -333,7 +338,7 @@ def test_a_zero_action_holds_the_start_whatever_was_done_before(
         np.testing.assert_allclose(observation["robot0_gripper_qpos"], fingers, atol=1e-4)
 
 
-def test_an_action_moves_the_end_effector_along_its_axis(envs: dict[str, SawyerEnv]) -> None:
+def test_an_action_moves_the_end_effector_along_its_axis(envs: dict[str, TabletopEnv]) -> None:
     for axis in range(3):
         envs["reach"].reset(seed=0)
         start = eef(envs["reach"])
@@ -345,7 +350,7 @@ def test_an_action_moves_the_end_effector_along_its_axis(envs: dict[str, SawyerE
 
 
 def test_the_gripper_closes_on_plus_one_and_opens_on_minus_one(
-    envs: dict[str, SawyerEnv],
+    envs: dict[str, TabletopEnv],
 ) -> None:
     env = envs["reach"]
     opened = env.reset(seed=0)[0]["robot0_gripper_qpos"]
@@ -361,7 +366,7 @@ def test_the_gripper_closes_on_plus_one_and_opens_on_minus_one(
 # -- rewards ---------------------------------------------------------------------------------------
 
 
-def expected_terms(env: SawyerEnv, cube_start: np.ndarray) -> dict[str, float]:
+def expected_terms(env: TabletopEnv, cube_start: np.ndarray) -> dict[str, float]:
     """The rewards of the task, from the simulator's state alone."""
     task = env.task
     goal = simulator(env)[1].site("goal_marker").xpos if task == "reach" else cube(env)
@@ -378,11 +383,11 @@ def expected_terms(env: SawyerEnv, cube_start: np.ndarray) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_rewards_are_those_of_the_equations(envs: dict[str, SawyerEnv], task: str) -> None:
+def test_rewards_are_those_of_the_equations(envs: dict[str, TabletopEnv], task: str) -> None:
     env = envs[task]
     env.reset(seed=3)
     start = np.zeros(3) if task == "reach" else cube(env)
-    expert = make_expert(task, env.robosuite_env)
+    expert = make_expert(env.robosuite_env)
     seen: dict[str, set[float]] = {name: set() for name in REWARD_TERMS}
     for _ in range(90):
         _, reward, _, _, info = env.step(expert().astype(np.float32))
@@ -399,7 +404,7 @@ def test_rewards_are_those_of_the_equations(envs: dict[str, SawyerEnv], task: st
         assert (len(seen[name]) > 1) == active, name
 
 
-def test_a_reset_gives_no_reward(envs: dict[str, SawyerEnv]) -> None:
+def test_a_reset_gives_no_reward(envs: dict[str, TabletopEnv]) -> None:
     for env in envs.values():
         _, info = env.reset(seed=0)
         none = {f"reward_{name}": 0.0 for name in REWARD_TERMS}
@@ -411,14 +416,14 @@ def test_a_reset_gives_no_reward(envs: dict[str, SawyerEnv]) -> None:
 
 @pytest.mark.parametrize(("distance", "expected"), [(0.015, True), (0.025, False)])
 def test_reach_succeeds_within_2_cm(
-    envs: dict[str, SawyerEnv], distance: float, expected: bool
+    envs: dict[str, TabletopEnv], distance: float, expected: bool
 ) -> None:
     env = envs["reach"]
     for seed, direction in enumerate(np.vstack([np.eye(3), -np.eye(3)])):
         observation, _ = env.reset(seed=seed)
         target = observation["goal_pos"] + distance * direction
         _, data = simulator(env)
-        for i, angle in enumerate(env.robosuite_env._inverse_kinematics(target)):
+        for i, angle in enumerate(inverse_kinematics(env.robosuite_env, target)):
             data.joint(f"robot0_right_j{i}").qpos[:] = angle
         env.robosuite_env.sim.forward()
         np.testing.assert_allclose(eef(env), target, atol=1e-4)
@@ -430,13 +435,13 @@ def test_reach_succeeds_within_2_cm(
     [(0.0, 0.06, True), (0.0, 0.04, False), (0.0115, 0.06, False), (0.0115, 0.04, False)],
 )
 def test_lift_succeeds_with_the_cube_grasped_and_5_cm_up(
-    envs: dict[str, SawyerEnv], fingers: float, height: float, expected: bool
+    envs: dict[str, TabletopEnv], fingers: float, height: float, expected: bool
 ) -> None:
     env = envs["lift"]
     env.reset(seed=0)
     target = cube(env) + np.array([0.0, 0.0, height])
     _, data = simulator(env)
-    for i, angle in enumerate(env.robosuite_env._inverse_kinematics(target)):
+    for i, angle in enumerate(inverse_kinematics(env.robosuite_env, target)):
         data.joint(f"robot0_right_j{i}").qpos[:] = angle
     place_fingers(env, fingers)
     place_cube(env, target)
@@ -444,7 +449,7 @@ def test_lift_succeeds_with_the_cube_grasped_and_5_cm_up(
     assert success(env) == expected
 
 
-def test_a_cube_held_by_one_finger_is_not_grasped(envs: dict[str, SawyerEnv]) -> None:
+def test_a_cube_held_by_one_finger_is_not_grasped(envs: dict[str, TabletopEnv]) -> None:
     env = envs["lift"]
     env.reset(seed=0)
     place_fingers(env, 0.0115)
@@ -470,7 +475,7 @@ def test_a_cube_held_by_one_finger_is_not_grasped(envs: dict[str, SawyerEnv]) ->
 )
 @pytest.mark.parametrize("task", PUSH_TASKS)
 def test_push_succeeds_7_cm_along_and_little_sideways(
-    envs: dict[str, SawyerEnv], task: str, along: float, sideways: float, expected: bool
+    envs: dict[str, TabletopEnv], task: str, along: float, sideways: float, expected: bool
 ) -> None:
     env = envs[task]
     env.reset(seed=0)
@@ -481,14 +486,14 @@ def test_push_succeeds_7_cm_along_and_little_sideways(
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_no_task_starts_solved(envs: dict[str, SawyerEnv], task: str) -> None:
+def test_no_task_starts_solved(envs: dict[str, TabletopEnv], task: str) -> None:
     for seed in range(10):
         envs[task].reset(seed=seed)
         assert not success(envs[task])
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_the_goal_marker_stands_at_the_goal(envs: dict[str, SawyerEnv], task: str) -> None:
+def test_the_goal_marker_stands_at_the_goal(envs: dict[str, TabletopEnv], task: str) -> None:
     for seed in (0, 1):
         observation, _ = envs[task].reset(seed=seed)
         marker = simulator(envs[task])[1].site("goal_marker").xpos
@@ -507,8 +512,7 @@ except BaseException as error:
     print(f"{type(error).__name__}: {error}")
     sys.exit(77)
 import numpy as np
-from torchrl_bmrl.envs.sawyer import SawyerEnv
-env = SawyerEnv("reach", render_mode="rgb_array", image_size=(256, 320))
+env = TabletopEnv("reach", render_mode="rgb_array", image_size=(256, 320))
 env.reset(seed=1)
 shown = env.render()
 again = env.render()
@@ -545,7 +549,7 @@ def test_the_goal_marker_is_visible_in_the_picture(tmp_path: Path) -> None:
     assert max(np.ptp(rows), np.ptp(columns)) < 15  # one spot
 
 
-def test_without_render_mode_there_is_no_picture(envs: dict[str, SawyerEnv]) -> None:
+def test_without_render_mode_there_is_no_picture(envs: dict[str, TabletopEnv]) -> None:
     assert envs["reach"].render() is None
 
 
@@ -574,7 +578,7 @@ def test_importing_constructing_and_stepping_print_nothing(tmp_path: Path) -> No
 # -- bad input -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("make", [SawyerEnv, make_env, make_robosuite_env, gymnasium_id])
+@pytest.mark.parametrize("make", [TabletopEnv, make_env, TabletopScene, gymnasium_id])
 def test_an_unknown_task_is_answered_with_the_valid_ones(make: Any) -> None:
     with pytest.raises(UnknownNameError, match="unknown task 'lfit'") as caught:
         make("lfit")
@@ -583,7 +587,7 @@ def test_an_unknown_task_is_answered_with_the_valid_ones(make: Any) -> None:
 
 def test_an_unknown_render_mode_is_answered_with_the_valid_one() -> None:
     with pytest.raises(UnknownNameError, match=r"'human'.*rgb_array"):
-        SawyerEnv("reach", render_mode="human")
+        TabletopEnv("reach", render_mode="human")
 
 
 @pytest.mark.parametrize(
@@ -592,7 +596,7 @@ def test_an_unknown_render_mode_is_answered_with_the_valid_one() -> None:
     ids=["nan", "inf", "six", "batch"],
 )
 def test_a_bad_action_is_refused_and_moves_nothing(
-    envs: dict[str, SawyerEnv], action: np.ndarray
+    envs: dict[str, TabletopEnv], action: np.ndarray
 ) -> None:
     env = envs["reach"]
     env.reset(seed=0)
