@@ -103,7 +103,7 @@ def test_clusters_by_chance_give_about_nothing_however_many() -> None:
     rng = np.random.default_rng(0)
     for groups in (2, 3, 20):
         values = [
-            stage_agreement(rng.integers(groups, size=len(phase)), phase, episode, resamples=1)
+            stage_agreement(rng.integers(groups, size=len(phase)), phase, episode)
             for _ in range(20)
         ]
         assert abs(np.mean([v.value for v in values])) < 0.01
