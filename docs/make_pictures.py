@@ -2,8 +2,8 @@
 
     python docs/make_pictures.py
 
-The way of the data, the six tasks, and the embedding of the policy that the repository holds. Needs
-the extras robosuite and reports, and EGL or OSMesa. The curves of stage 1 are recipes/publish.py's.
+They are the data flow, the six tasks, and the embedding of the policy in this repository. Needs the
+extras robosuite and reports, and EGL or OSMesa. docs/results/publish.py draws the curves of stage 1.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from torchrl_bmrl.experts.collect import collect_episode
 from torchrl_bmrl.experts.controllers import ExpertGains
 from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.pipeline.agents import load_student
-from torchrl_bmrl.reports import TASK_COLORS, embedding_scatter, task_name
+from torchrl_bmrl.reports import embedding_scatter, task_colors, task_name
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 DOCS = Path(__file__).parent
@@ -32,7 +32,7 @@ SIZE = 256  # pixels of a picture of a task
 
 
 def data_flow() -> bytes:
-    """From demonstrations to one policy."""
+    """The data flow from demonstrations to one policy."""
     figure = Figure(figsize=(9.5, 4.2), layout="constrained")
     axes = figure.subplots()
     axes.set_xlim(0, 19)
@@ -52,7 +52,7 @@ def data_flow() -> bytes:
             middle = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2 + 0.25
             axes.text(*middle, text, ha="center", fontsize=7.5, color="#555555")
 
-    grey, blue, green = "#555555", TASK_COLORS["reach"], TASK_COLORS["push_right"]
+    grey, (blue, _, green) = "#555555", task_colors(3)
     for row, name in enumerate(("reach", "lift", "four pushes")):
         y = 5.4 - 2.4 * row
         box(0.1, y, 3.4, f"demonstrations\n{name}", grey)
@@ -79,7 +79,7 @@ def data_flow() -> bytes:
 
 
 def tasks() -> bytes:
-    """An expert's episode of each task, half a second after it succeeded."""
+    """One picture of each task, half a second after the expert succeeded."""
     scenes = []
     for task in TASKS:
         episode = collect_episode(task, 3, noise=0.2, gains=ExpertGains())
@@ -95,19 +95,20 @@ def tasks() -> bytes:
 
 
 def embedding() -> bytes:
-    """One held-out demonstration of each task, as the policy of the repository sees it."""
+    """Embeddings of one held-out demonstration of each task by the policy in this repository."""
     student, metadata = load_student(POLICY)
     state, _ = load_checkpoint(POLICY, kind="student")
     points, labels = [], []
-    for task in metadata["tasks"]:
+    for index, task in enumerate(metadata["tasks"]):
         episode = TensorDict(state["demonstrations"][task]).auto_batch_size_(1)
         points.append(student.embed(episode))
-        labels += [TASKS.index(task)] * len(points[-1])
-    return embedding_scatter(torch.cat(points).numpy(), np.array(labels))
+        labels += [index] * len(points[-1])
+    titles = list(map(task_name, metadata["tasks"]))
+    return embedding_scatter(torch.cat(points).numpy(), np.array(labels), titles)
 
 
 def png(figure: Figure) -> bytes:
-    """With few colours, so that it is small."""
+    """Renders a figure with few colours, so that the file is small."""
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=110, metadata={"Software": None})
     image = Image.open(buffer).convert("RGB").quantize(128)
@@ -116,7 +117,7 @@ def png(figure: Figure) -> bytes:
 
 
 def main() -> None:
-    """Writes the pictures and says how large they are."""
+    """Writes the pictures and prints their sizes."""
     for name, draw in {"data_flow": data_flow, "tasks": tasks, "embedding": embedding}.items():
         path = DOCS / "images" / f"{name}.png"
         path.parent.mkdir(exist_ok=True)

@@ -42,9 +42,9 @@ from torchrl_bmrl.evaluation.rollout import EpisodeOutcome, evaluate_policy
 from torchrl_bmrl.experts.collect import collect_episode
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
-from torchrl_bmrl.names import TASKS, horizon_of
+from torchrl_bmrl.names import horizon_of
 from torchrl_bmrl.pipeline.agents import Student, load_bcq_loss, load_student
-from torchrl_bmrl.reports import Embeddings, write_report
+from torchrl_bmrl.reports import Embeddings, task_titles, write_report
 from torchrl_bmrl.reports.films import explore_demonstrations
 from torchrl_bmrl.run.folder import read_versions
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
@@ -204,11 +204,10 @@ def embed(config: Config, split: str) -> tuple[Embeddings, float]:
         phases.append(phase.numpy())
         phase_names |= {task: names} if names else {}
     data = torch.cat([part.select(*parts[0].keys(True, True)) for part in parts])
-    # Class indices are positions in config.tasks; the report's are positions among all tasks.
-    position = torch.tensor([TASKS.index(task) for task in config.tasks])
     embeddings = Embeddings(
+        tasks=list(config.tasks),
         task_latent=student.embed(data).numpy(),
-        task=position[data["task"]].numpy(),
+        task=data["task"].numpy(),
         episode=data["episode"].numpy(),
         step=data["step"].numpy(),
         distance=np.concatenate(distances),
@@ -257,6 +256,7 @@ def evaluate(config: Config) -> None:
     look = not alone and config.distill.task_encoder == "transition"
     write_report(
         run_dir,
+        titles=task_titles(config.tasks),
         default_source=config.evaluate.latent_sources[0],
         facts=run_facts(config),
         seed=config.seed,

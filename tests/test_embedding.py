@@ -221,14 +221,14 @@ def test_what_does_not_fit_is_refused_by_name() -> None:
 
 def test_stages_are_looked_for_in_successful_episodes_alone() -> None:
     pytest.importorskip("matplotlib")
-    from torchrl_bmrl.names import TASKS
     from torchrl_bmrl.reports import Embeddings
 
     episode, step = (a.ravel() for a in np.meshgrid(range(3), range(40)))
     zeros = np.zeros(episode.size, dtype=int)
     embeddings = Embeddings(
+        tasks=["reach", "lift"],
         task_latent=np.zeros((episode.size, 2)),
-        task=zeros + TASKS.index("lift"),
+        task=zeros + 1,
         episode=episode,
         step=step,
         distance=zeros,
