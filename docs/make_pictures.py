@@ -20,7 +20,7 @@ from tensordict import TensorDict
 
 from torchrl_bmrl.envs.rendering import render_states
 from torchrl_bmrl.pipeline.agents import load_student
-from torchrl_bmrl.reports import TASK_COLORS, embedding_scatter, task_name
+from torchrl_bmrl.reports import embedding_scatter, task_name
 from torchrl_bmrl.tasks import get_task
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
@@ -97,11 +97,12 @@ def embedding() -> bytes:
     student, metadata = load_student(POLICY)
     state, _ = load_checkpoint(POLICY, kind="student")
     points, labels = [], []
-    for task in metadata["tasks"]:
+    for index, task in enumerate(metadata["tasks"]):
         episode = TensorDict(state["demonstrations"][task]).auto_batch_size_(1)
         points.append(student.embed(episode))
-        labels += [tasks.index(task)] * len(points[-1])
-    return embedding_scatter(torch.cat(points).numpy(), np.array(labels))
+        labels += [index] * len(points[-1])
+    titles = list(map(task_name, metadata["tasks"]))
+    return embedding_scatter(torch.cat(points).numpy(), np.array(labels), titles)
 
 
 def png(figure: Figure) -> bytes:

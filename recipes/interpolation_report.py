@@ -18,9 +18,13 @@ from torchrl_bmrl.evaluation.behaviour import (
     occupied_cells,
     spread,
 )
-from torchrl_bmrl.names import TASKS
-from torchrl_bmrl.reports import Picture, Table
-from torchrl_bmrl.reports.figures import behaviour_trajectories, embedding_paths
+from torchrl_bmrl.reports import (
+    Picture,
+    Table,
+    behaviour_trajectories,
+    embedding_paths,
+    task_name,
+)
 from torchrl_bmrl.reports.tables import MISSING
 
 METHODS = {
@@ -179,10 +183,10 @@ def make_pictures(
         {name.replace("_", " "): moved(played[name], "eef") for name in shown},
         {name.replace("_", " "): played[name]["along"] for name in shown},
     )
-    position = np.repeat(
-        [TASKS.index(task) for task in embeddings], list(map(len, embeddings.values()))
-    )
-    drawn = embedding_paths(np.concatenate(list(embeddings.values())), position, paths, random)
+    points = list(embeddings.values())
+    index = np.repeat(np.arange(len(points)), list(map(len, points)))
+    titles = list(map(task_name, embeddings))
+    drawn = embedding_paths(np.concatenate(points), index, titles, paths, random)
     return {
         "interpolation_trajectories": Picture(
             png=trajectories,

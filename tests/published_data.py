@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
-from torchrl_bmrl.evaluation import ResultRow
-from torchrl_bmrl.names import TASKS
-from torchrl_bmrl.reports.published import CurveRow, Published, RunRow
+DOCS = Path(__file__).parents[1] / "docs"
+sys.path.append(str(DOCS / "results"))
+
+from published import TASKS, CurveRow, Published, RunRow  # noqa: E402
+
+from torchrl_bmrl.evaluation import ResultRow  # noqa: E402
 
 ARMS = {
     ("expert", ""): 1.0,

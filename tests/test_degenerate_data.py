@@ -297,20 +297,23 @@ def test_a_path_takes_short_hops_however_short(scale: float) -> None:
 def test_pictures_of_degenerate_embeddings_are_drawn(points: str, dim: int, rows: int) -> None:
     pytest.importorskip("matplotlib")
     pytest.importorskip("sklearn")
-    from torchrl_bmrl.reports import figures
+    from torchrl_bmrl.reports import drawing, embedding_figures
 
     x = POINTS[points][:rows, :dim]
-    plane, note = figures._plane(x)
+    plane, note = drawing.plane(x)
     assert plane.shape == (rows, 2)
     assert finite(plane)
     assert "nan" not in note
     task, episode = np.arange(rows) % 6, np.arange(rows) // 10
     if rows == 20:
-        assert finite(figures._tsne(x, 0)[1])
+        assert finite(drawing.tsne(x, 0)[1])
     if rows != 2:  # the drawing itself takes time
-        figures.embedding_scatter(x, task)
-        figures.reach_trajectories(x, episode, np.zeros(rows), success_point=x[0])
-        figures.embedding_paths(x, task, {"straight": [x[:2]]}, x[:1])
+        titles = list("abcdef")
+        embedding_figures.embedding_scatter(x, task, titles)
+        embedding_figures.embedding_trajectories(
+            x, episode, np.zeros(rows), title="Reach", success_point=x[0]
+        )
+        embedding_figures.embedding_paths(x, task, titles, {"straight": [x[:2]]}, x[:1])
 
 
 def test_pictures_of_returns_that_are_all_the_same_are_drawn() -> None:
@@ -327,9 +330,13 @@ def test_pictures_of_returns_that_are_all_the_same_are_drawn() -> None:
 def test_tables_leave_out_shares_of_a_return_that_is_not_positive() -> None:
     pytest.importorskip("matplotlib")
     pytest.importorskip("scipy")
+    import published_data  # noqa: F401 -- makes the scripts of docs/results importable
+
+    # isort: split
+    import comparisons
+
     from torchrl_bmrl.evaluation.results import ResultRow, summarise
     from torchrl_bmrl.names import TASKS
-    from torchrl_bmrl.reports import comparisons
 
     rows = [
         ResultRow(
@@ -349,7 +356,7 @@ def test_tables_leave_out_shares_of_a_return_that_is_not_positive() -> None:
     assert comparisons.difference(rows, rows, bcq, expert) is None
     assert comparisons.difference(rows, rows, bcq, expert, ["reach"]) is not None
     text = [
-        comparisons.differences_table(rows, [bcq], expert).markdown(level=3),
+        comparisons.differences_table(rows, [bcq]).markdown(level=3),
         comparisons.policies_table(
             rows, summarise(rows), {bcq: "BCQ"}, expert, title="T", caption="C"
         ).markdown(level=3),

@@ -24,9 +24,17 @@ from PIL import Image
 
 from torchrl_bmrl.errors import BMRLError, DataError, RenderError
 from torchrl_bmrl.names import TASKS
-from torchrl_bmrl.reports import TASK_COLORS, Embeddings, Explorer, Section, write_page
+from torchrl_bmrl.reports import (
+    Embeddings,
+    Explorer,
+    Section,
+    task_colors,
+    task_titles,
+    write_page,
+)
 
 STEPS = 21
+TASK_COLORS = dict(zip(TASKS, task_colors(len(TASKS)), strict=True))
 EVIL = "</script><script>document.title = 'taken'</script>"
 
 
@@ -43,6 +51,8 @@ def make_explorer(**changes: Any) -> Explorer:
     """
     task, episode, step = (a.ravel() for a in np.mgrid[:6, :2, :STEPS])
     explorer = Explorer(
+        titles=list(task_titles(TASKS).values()),
+        periods=dict.fromkeys(range(6), 0.05),
         task_latent=np.stack([step / 2.0, 2.0 * task + episode], axis=1),
         task=task,
         episode=episode,
@@ -142,7 +152,7 @@ def test_what_does_not_fit_is_refused_by_name() -> None:
         ("task", np.full(rows, 6)),
         ("episode", np.zeros(rows - 1, dtype=int)),
         ("step", np.zeros(rows, dtype=int)),
-        ("distance", np.full(rows, np.nan)),
+        ("distance", np.full(rows, np.inf)),
         ("phase", ["far"]),
         ("success", np.zeros((rows, 1), dtype=bool)),
         ("frames", {(0, 0, STEPS): b""}),
@@ -198,6 +208,7 @@ def write_demonstrations(folder: Path, *, states: bool = True) -> Embeddings:
     write_episodes(folder / "lift.hdf5", map(episode, range(4)), masks=masks, env_args={})
     number, step = (a.ravel() for a in np.mgrid[:3, :6])
     return Embeddings(
+        tasks=TASKS,
         task_latent=np.stack([number, step], axis=1) / 2,
         task=np.full(18, TASKS.index("lift")),
         episode=number,
@@ -217,7 +228,7 @@ def test_phases_and_successes_are_those_of_the_file(tmp_path: Path) -> None:
     ]
     assert explorer.success.tolist() == [False, False, False, False, True, True] * 3
     assert not explorer.frames
-    assert "hold no simulator states" in explorer.note
+    assert "contain no simulator states" in explorer.note
 
 
 def test_transitions_that_the_file_does_not_hold_are_refused(tmp_path: Path) -> None:

@@ -14,13 +14,10 @@ for extra in ("scipy", "matplotlib", "jinja2", "sklearn"):
 
 from published_data import make_curves, make_published, make_rows, make_run
 
+# isort: split
+from published import Published, read_curve_rows, read_published, write_published
+
 from torchrl_bmrl.errors import DataError
-from torchrl_bmrl.reports.published import (
-    Published,
-    read_curve_rows,
-    read_published,
-    write_published,
-)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -84,7 +81,7 @@ def test_returns_have_three_decimals(tmp_path: Path) -> None:
         ("episodes", "none,reach,expert", ",reach,expert", r"ablation: .*line 2 is ''; .*a name"),
         ("episodes", "return", "reward", r"return: column is missing"),
         ("curves", "reach,1,1,1000", "reach,1,1.5,1000", r"epoch: .*'1.5'; .*whole number"),
-        ("curves", "reach,1,1,1000,1", "reach,1,1,1000,0", r"line 3 is of the same as line 2"),
+        ("curves", "reach,1,1,1000,1", "reach,1,1,1000,0", r"line 3 repeats line 2"),
         ("curves", "reach,1,1,1000,0", "reach,7,1,1000,0", r"'paper', 'none', 7.* not in runs"),
         ("runs", "paper,none,1", "paper,none,9", r"'paper', 'none', 1.* not in runs"),
         ("runs", "0.989", "much", r"accuracy: .*'much'; expected a finite number"),

@@ -22,32 +22,37 @@ from torchrl_bmrl.evaluation import ResultRow, summarise, write_results
 from torchrl_bmrl.evaluation.embedding import STAGE_TAIL
 from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports import (
-    TASK_COLORS,
     Embeddings,
     Section,
     Table,
+    behaviour_trajectories,
+    embedding_paths,
     embedding_scatter,
     embedding_stages,
+    embedding_trajectories,
     embedding_tsne,
     goal_distance_table,
     measure_goal_distance,
     measure_stages,
     paper,
-    reach_trajectories,
     read_stage1_curves,
     results_table,
     stage1_curves,
     stages_table,
     table_1,
     table_2,
+    task_colors,
+    task_titles,
     write_page,
     write_report,
 )
-from torchrl_bmrl.reports.figures import behaviour_trajectories, embedding_paths
+from torchrl_bmrl.reports.drawing import _lab
 
 ARMS = [("expert", ""), ("bcq", ""), ("distilled", "prototype"), ("distilled", "online")]
 
 
+TITLES = task_titles(TASKS)
+NAMES = list(TITLES.values())
 TABLES = ("results", "table1", "table2", "stages", "goal_distance")
 
 
@@ -78,6 +83,7 @@ def make_embeddings(dim: int = 2) -> Embeddings:
     task, episode, step = task[shuffle], episode[shuffle], step[shuffle]
     latent = rng.normal(size=(task.size, dim)) + 5.0 * task[:, None]
     return Embeddings(
+        tasks=TASKS,
         task_latent=latent,
         task=task,
         episode=episode,
@@ -201,10 +207,11 @@ def test_results_table_holds_every_summary() -> None:
 
 def test_what_was_not_measured_is_a_dash() -> None:
     summaries = [s for s in summarise(make_rows(("lift",))) if s.policy != "bcq"]
-    lift = cells(table_2(summaries, default_source="prototype"))[TASKS.index("lift")]
+    table = table_2(summaries, default_source="prototype", titles=TITLES)
+    lift = cells(table)[TASKS.index("lift")]
     assert lift["prototype: return"] != "–"
     assert lift["prototype: % of BCQ"] == "–"
-    assert cells(table_1(summaries))[0]["Here: expert"] == "–"
+    assert cells(table_1(summaries, titles=TITLES))[0]["Here: expert"] == "–"
 
 
 def test_markdown_html_and_csv_hold_the_same_cells() -> None:
@@ -233,9 +240,19 @@ def test_markdown_html_and_csv_hold_the_same_cells() -> None:
 # Figures
 
 
-def test_every_task_has_its_own_color() -> None:
-    assert list(TASK_COLORS) == list(TASKS)
-    assert len(set(TASK_COLORS.values())) == len(TASKS)
+def trajectories(*arguments: Any, **options: Any) -> bytes:
+    return embedding_trajectories(*arguments, title="Reach", **options)
+
+
+@pytest.mark.parametrize("count", [6, 14, 24])
+def test_colors_are_far_apart_and_do_not_change_with_the_number_of_tasks(count: int) -> None:
+    colors = task_colors(count)
+    assert colors[:3] == task_colors(3)
+    assert len(colors) == count
+    lab = _lab(np.array([[int(c[i : i + 2], 16) / 255 for i in (1, 3, 5)] for c in colors]))
+    apart = np.linalg.norm(lab[:, None] - lab, axis=-1)[~np.eye(count, dtype=bool)]
+    assert apart.min() > 25.0  # a just noticeable difference is about 2
+    assert lab[:, 0].max() < 80.0  # dark enough on white
 
 
 def test_figures_repeat_exactly_and_change_with_the_data() -> None:
@@ -243,13 +260,15 @@ def test_figures_repeat_exactly_and_change_with_the_data() -> None:
     moved = data.task_latent + data.step[:, None]
     curve = [(e, 10 * e, np.array([1.0 * e, 2.0 * e])) for e in (1, 2, 3)]
     draws = [
-        lambda m: embedding_scatter(m, data.task),
-        lambda m: embedding_tsne(m, data.task, seed=0),
-        lambda m: reach_trajectories(m, data.episode, data.distance),
-        lambda m: reach_trajectories(m, data.episode, data.distance, success_point=m[0]),
+        lambda m: embedding_scatter(m, data.task, NAMES),
+        lambda m: embedding_tsne(m, data.task, NAMES, seed=0),
+        lambda m: trajectories(m, data.episode, data.distance),
+        lambda m: trajectories(m, data.episode, data.distance, success_point=m[0]),
         lambda m: embedding_stages(m, data.phase, data.step // 3, ("a", "b", "c")),
         lambda m: stage1_curves({"lift": curve}, expert_means={"lift": float(m.sum())}),
-        lambda m: embedding_paths(m, data.task, {"straight": [m[:5]], "curve": [m[3:7]]}, m[:2]),
+        lambda m: embedding_paths(
+            m, data.task, NAMES, {"straight": [m[:5]], "curve": [m[3:7]]}, m[:2]
+        ),
         lambda m: behaviour_trajectories(
             {"line": np.tile(m, (1, 1, 2))[..., :3]}, {"line": m[:1, :1]}
         ),
@@ -265,11 +284,10 @@ def test_figures_repeat_exactly_and_change_with_the_data() -> None:
 def test_colors_follow_task_and_distance() -> None:
     data = make_embeddings()
     swapped = (data.task + 1) % 6
-    assert embedding_scatter(data.task_latent, data.task) != embedding_scatter(
-        data.task_latent, swapped
-    )
-    assert reach_trajectories(data.task_latent, data.episode, data.distance) != reach_trajectories(
-        data.task_latent, data.episode, data.distance[::-1]
+    latent = data.task_latent
+    assert embedding_scatter(latent, data.task, NAMES) != embedding_scatter(latent, swapped, NAMES)
+    assert trajectories(latent, data.episode, data.distance) != trajectories(
+        latent, data.episode, data.distance[::-1]
     )
 
 
@@ -277,14 +295,16 @@ def test_colors_follow_task_and_distance() -> None:
 def test_embeddings_of_other_sizes_are_drawn(dim: int) -> None:
     data = make_embeddings(dim)
     for image in (
-        embedding_scatter(data.task_latent, data.task),
-        embedding_tsne(data.task_latent[:40], data.task[:40]),
-        reach_trajectories(data.task_latent, data.episode, data.distance),
-        reach_trajectories(
+        embedding_scatter(data.task_latent, data.task, NAMES),
+        embedding_tsne(data.task_latent[:40], data.task[:40], NAMES),
+        trajectories(data.task_latent, data.episode, data.distance),
+        trajectories(
             data.task_latent, data.episode, data.distance, success_point=data.task_latent[0]
         ),
         embedding_stages(data.task_latent[:40], data.phase[:40], data.phase[:40], ("a", "b", "c")),
-        embedding_paths(data.task_latent, data.task, {"curve": [data.task_latent]}, np.eye(1, dim)),
+        embedding_paths(
+            data.task_latent, data.task, NAMES, {"curve": [data.task_latent]}, np.eye(1, dim)
+        ),
     ):
         assert image.startswith(b"\x89PNG")
 
@@ -293,11 +313,11 @@ def test_figures_refuse_what_they_cannot_draw() -> None:
     with pytest.raises(BMRLError, match="no curve"):
         stage1_curves({})
     with pytest.raises(BMRLError, match=r"\[0, 6\).*7"):
-        embedding_scatter(np.zeros((1, 2)), np.array([7]))
+        embedding_scatter(np.zeros((1, 2)), np.array([7]), NAMES)
     with pytest.raises(BMRLError, match="at least 4"):
-        embedding_tsne(np.zeros((3, 2)), np.zeros(3, dtype=int))
+        embedding_tsne(np.zeros((3, 2)), np.zeros(3, dtype=int), NAMES)
     with pytest.raises(BMRLError, match="no trajectory"):
-        reach_trajectories(np.zeros((0, 2)), np.zeros(0, dtype=int), np.zeros(0))
+        trajectories(np.zeros((0, 2)), np.zeros(0, dtype=int), np.zeros(0))
     with pytest.raises(BMRLError, match="no trajectory"):
         behaviour_trajectories({}, {})
 
@@ -305,6 +325,7 @@ def test_figures_refuse_what_they_cannot_draw() -> None:
 def test_embeddings_refuse_what_does_not_fit() -> None:
     zeros = np.zeros(3, dtype=int)
     fits: dict[str, Any] = {
+        "tasks": ["reach"],
         "task_latent": np.zeros((3, 2)),
         "task": zeros,
         "episode": zeros,
@@ -314,13 +335,14 @@ def test_embeddings_refuse_what_does_not_fit() -> None:
     for name, value in (
         ("task_latent", np.zeros(3)),
         ("task_latent", np.full((3, 2), np.nan)),
+        ("task", zeros + 1),
         ("step", np.zeros(4, dtype=int)),
         ("distance", np.full(3, np.inf)),
         ("success", np.zeros((3, 1), dtype=bool)),
         ("baselines", {"raw": np.zeros((2, 5))}),
         ("phase_names", {"reach": ()}),
     ):
-        message = {"baselines": "raw", "phase_names": r"phase holds \[0\] for reach"}
+        message = {"baselines": "raw", "phase_names": r"phase contains \[0\] for reach"}
         with pytest.raises(BMRLError, match=message.get(name, name)):
             Embeddings(**{**fits, name: value})
 
@@ -438,7 +460,7 @@ def test_a_whole_report_is_written_and_stands_alone(tmp_path: Path) -> None:
                 "embedding",
                 "embedding_tsne",
                 "embedding_stages",
-                "reach_trajectories",
+                "embedding_trajectories",
             )
         ),
     }
@@ -506,7 +528,7 @@ def test_the_report_does_not_depend_on_the_order_of_transitions(tmp_path: Path) 
 
 def test_curves_are_grouped_by_epoch_in_order(tmp_path: Path) -> None:
     write_curves(tmp_path, "lift", [(2, 20, 0, 5.0, 1), (1, 10, 0, 1.0, 0), (1, 10, 1, 3.0, 0)])
-    curves = read_stage1_curves(tmp_path)
+    curves = read_stage1_curves(tmp_path, TASKS)
     assert list(curves) == ["lift"]
     assert [(e, u, r.tolist()) for e, u, r in curves["lift"]] == [
         (1, 10, [1.0, 3.0]),
@@ -515,10 +537,10 @@ def test_curves_are_grouped_by_epoch_in_order(tmp_path: Path) -> None:
 
 
 def test_bad_input_leaves_the_old_report(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"results\.csv: no such file"):
+    with pytest.raises(DataError, match=r"results\.csv: contains no episode"):
         write_report(tmp_path, default_source="online", facts={})
     write_results(tmp_path / "results.csv", [])
-    with pytest.raises(DataError, match="holds no episode"):
+    with pytest.raises(DataError, match="contains no episode"):
         write_report(tmp_path, default_source="online", facts={})
     write_results(tmp_path / "results.csv", make_rows())
     page = write_report(tmp_path, default_source="online", facts={})

@@ -99,15 +99,15 @@ def test_columns_are_those_of_the_format(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("column", "value", "valid"),
     [
-        ("task", "lfit", "push_right"),
-        ("policy", "sac", "expert, bcq, distilled"),
+        ("task", "", "a name"),
+        ("policy", "", "a name"),
         ("latent_source", "", "a source's name"),
         ("seed", "zero", "whole number"),
         ("episode", "1.5", "whole number"),
         ("return", "nan", "finite number"),
         ("return", "inf", "finite number"),
         ("return", "much", "finite number"),
-        ("success", "True", "0, 1"),
+        ("success", "True", "0, 1, or nothing if unknown"),
     ],
 )
 def test_a_bad_value_is_named_with_file_line_and_column(
@@ -185,8 +185,8 @@ def test_summaries_come_in_the_order_of_the_tables_whatever_the_order_of_rows() 
     pytest.importorskip("scipy")
     rows = [*sample_rows(), *(replace(ROW, task=t, policy="expert") for t in reversed(TASKS))]
     shuffled = random.Random(0).sample(rows, len(rows))
-    assert summarise(shuffled) == summarise(rows)
-    order = [(s.task, s.policy, s.latent_source) for s in summarise(shuffled)]
+    assert summarise(shuffled, TASKS) == summarise(rows, TASKS)
+    order = [(s.task, s.policy, s.latent_source) for s in summarise(shuffled, TASKS)]
     assert list(dict.fromkeys(task for task, _, _ in order)) == list(TASKS)
     assert [rest for task, *rest in order if task == "reach"] == [
         ["expert", ""],
@@ -194,6 +194,30 @@ def test_summaries_come_in_the_order_of_the_tables_whatever_the_order_of_rows() 
         ["distilled", "online"],
         ["distilled", "prototype"],
     ]
+
+
+def test_tasks_without_an_order_come_as_they_appear_and_policies_after_the_known_ones() -> None:
+    pytest.importorskip("scipy")
+    names = [("pour", "mine"), ("pour", "bcq"), ("ant", "bcq"), ("pour", "a_study")]
+    rows = [replace(ROW, task=task, policy=policy) for task, policy in names]
+    assert [(s.task, s.policy) for s in summarise(rows)] == [
+        ("pour", "bcq"),
+        ("pour", "a_study"),
+        ("pour", "mine"),
+        ("ant", "bcq"),
+    ]
+    assert [s.task for s in summarise(rows, ["ant"])] == ["ant", "pour", "pour", "pour"]
+
+
+def test_an_unknown_success_is_an_empty_cell_and_has_no_rate(tmp_path: Path) -> None:
+    pytest.importorskip("scipy")
+    rows = [replace(ROW, task="walk", episode=i, success=None) for i in range(3)]
+    write_results(tmp_path / "results.csv", rows)
+    assert (tmp_path / "results.csv").read_text().splitlines()[1] == "walk,bcq,,1,0,3.5,"
+    assert read_results(tmp_path / "results.csv") == rows
+    (summary,) = summarise(rows)
+    assert (summary.success_rate, summary.success_interval) == (None, None)
+    assert summary.mean_return == 3.5
 
 
 def test_one_episode_has_no_spread() -> None:

@@ -13,17 +13,15 @@ import pytest
 for extra in ("scipy", "matplotlib", "jinja2", "sklearn"):
     pytest.importorskip(extra)
 
-from published_data import cells, make_published
+from published_data import DOCS, cells, make_published
+
+# isort: split
+from published import TASKS, Published, write_published
+from results_page import check_results_page, make_results_page, write_results_page
 
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.evaluation import ResultRow
-from torchrl_bmrl.names import TASKS
-from torchrl_bmrl.reports import check_results_page, paper, write_results_page
-from torchrl_bmrl.reports.published import Published, write_published
-from torchrl_bmrl.reports.results_page import make_results_page
-from torchrl_bmrl.reports.tables import task_name
-
-DOCS = Path(__file__).parents[1] / "docs"
+from torchrl_bmrl.reports import paper, task_name
 
 
 @pytest.fixture(scope="module")

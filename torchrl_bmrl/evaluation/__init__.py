@@ -1,4 +1,4 @@
-"""Rolling policies out and summing up what happened."""
+"""Rollouts of policies, their results, and statistics of these."""
 
 from __future__ import annotations
 

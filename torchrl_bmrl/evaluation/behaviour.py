@@ -1,4 +1,4 @@
-"""What a set of episodes did, as numbers: where they went, how fast, to how many ends."""
+"""Measures of a set of episodes: space covered, speed, and outcomes for the cube."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from torchrl_bmrl.envs.skills import PUSH_DIRECTIONS
 from torchrl_bmrl.errors import BMRLError
 
 LIFTED = 0.05
-"""A cube that rose so far counts as lifted [m]: the lift task's own height."""
+"""Height above its start at which a cube counts as lifted [m], as in the lift task."""
 MOVED = 0.02
-"""A cube that ends so far from its start, along the table, counts as moved [m]."""
+"""Distance along the table from its start at which a cube counts as moved [m]."""
 CUBE_OUTCOMES = ("still", "lifted", *PUSH_DIRECTIONS)
-"""What may become of the cube."""
+"""Possible outcomes for the cube."""
 
 
 def occupied_cells(positions: ArrayLike, cell_size: float) -> NDArray[np.int64]:
-    """Cells of a fixed grid, one corner at the origin, that hold a position.
+    """Returns the cells of a fixed grid that contain a position; a corner is at the origin.
 
     Args:
         positions: shape ``(..., d)`` [m].
         cell_size: edge of a cell [m].
 
     Returns:
-        index of each such cell, once, in lexicographic order, shape ``(cells, d)``.
+        indices of the cells in lexicographic order, shape ``(cells, d)``.
 
     Raises:
         BMRLError: if the size is not positive or a position not finite.
@@ -46,22 +46,23 @@ def occupied_cells(positions: ArrayLike, cell_size: float) -> NDArray[np.int64]:
 def group_coverage(
     positions: ArrayLike, cell_size: float, *, group_size: int, seed: int = 0
 ) -> NDArray[np.int64]:
-    """Number of cells that the episodes of a group occupy together, for groups drawn at random.
+    """Counts the cells that the episodes of a group occupy together, for random disjoint groups.
 
-    The number for all episodes together has no honest bootstrap interval: an episode that is drawn
-    twice adds nothing. Groups share no episode, so that the mean over them has one.
+    The count over all episodes has no valid bootstrap interval, because an episode that is drawn
+    twice adds nothing. The mean over disjoint groups has one.
 
     Args:
-        positions: of each episode over time, shape ``(N, T, d)`` [m].
+        positions: positions of each episode over time, shape ``(N, T, d)`` [m].
         cell_size: edge of a cell [m].
-        group_size: episodes of a group; those that fill no group are left out.
-        seed: of the draw; it depends on nothing else, so that arms of equal N are grouped alike.
+        group_size: number of episodes in a group; a remainder is left out.
+        seed: seed of the draw. The groups depend on it and N alone, so that policies with equal N
+            are grouped alike.
 
     Returns:
         shape ``(N // group_size,)``.
 
     Raises:
-        BMRLError: if there is no whole group, and as :func:`occupied_cells`.
+        BMRLError: if there is no whole group, and in the cases of :func:`occupied_cells`.
 
     Example:
         >>> positions = np.zeros((4, 10, 3))
@@ -81,7 +82,7 @@ def group_coverage(
 
 
 def spread(points: ArrayLike) -> float:
-    r"""Root mean square distance of points from their mean, in their unit.
+    r"""Root mean square distance of points from their mean, in the points' unit.
 
     .. math:: \sqrt{\tfrac{1}{N} \sum_i \lVert x_i - \bar x \rVert^2}
 
@@ -89,7 +90,7 @@ def spread(points: ArrayLike) -> float:
         points: shape ``(N, d)``.
 
     Raises:
-        BMRLError: if there is none, or one is not finite.
+        BMRLError: if there is no point, or one is not finite.
 
     Example:
         >>> spread([[0.0, 0.0], [0.0, 2.0]])
@@ -100,17 +101,17 @@ def spread(points: ArrayLike) -> float:
 
 
 def mean_speed(positions: ArrayLike, seconds: float) -> NDArray[np.float64]:
-    """Mean speed of each episode: the length of its path over its time.
+    """Mean speed of each episode: the length of its path divided by its duration.
 
     Args:
         positions: shape ``(N, T, d)``, T of at least 2 [m].
-        seconds: between two positions [s].
+        seconds: time between two positions [s].
 
     Returns:
         shape ``(N,)`` [m/s].
 
     Raises:
-        BMRLError: if a path has less than two positions or one is not finite.
+        BMRLError: if a path has fewer than two positions or one is not finite.
 
     Example:
         >>> mean_speed([[[0.0, 0.0], [0.1, 0.0], [0.0, 0.0]]], 0.05).tolist()
@@ -123,14 +124,14 @@ def mean_speed(positions: ArrayLike, seconds: float) -> NDArray[np.float64]:
 
 
 def cube_outcomes(displacement: ArrayLike) -> list[str]:
-    """What became of the cube in each episode, one of :data:`CUBE_OUTCOMES`.
+    """Outcome for the cube in each episode, one of :data:`CUBE_OUTCOMES`.
 
-    ``lifted``: at some step :data:`LIFTED` above its start. Otherwise the direction, of the four,
-    along which it ends farthest from its start, or ``still`` if that is no more than
-    :data:`MOVED`.
+    It is ``lifted`` if the cube is :data:`LIFTED` above its start at some step. Otherwise it is the
+    push direction along which the cube ends farthest from its start, or ``still`` if the cube ends
+    within :data:`MOVED` of its start.
 
     Args:
-        displacement: of the cube from its start, over time, shape ``(N, T, 3)`` [m].
+        displacement: the cube's position relative to its start, shape ``(N, T, 3)`` [m].
 
     Raises:
         BMRLError: for another shape, or displacements that are not finite.
@@ -161,10 +162,10 @@ def effective_number(outcomes: Iterable[Hashable]) -> float:
     .. math:: \exp\bigl(-\textstyle\sum_k p_k \ln p_k\bigr)
 
     Args:
-        outcomes: one of each episode.
+        outcomes: outcome of each episode.
 
     Raises:
-        BMRLError: if there is none.
+        BMRLError: if there is no episode.
 
     Example:
         >>> effective_number(["lifted", "right", "lifted", "right"])
@@ -178,19 +179,19 @@ def effective_number(outcomes: Iterable[Hashable]) -> float:
 
 
 def matching_noise(actions: ArrayLike, size: float, *, seed: int = 0) -> float:
-    r"""Standard deviation of the action noise that moves actions as far as something else did.
+    r"""Standard deviation of action noise that causes a given mean deviation of the actions.
 
-    :math:`\sigma` such that the mean over actions of
+    It is the :math:`\sigma` for which the mean over actions of
     :math:`\lVert \operatorname{clip}(a + \sigma \varepsilon, -1, 1) - a \rVert` is ``size``, with
-    one draw of :math:`\varepsilon \sim N(0, I)` for each action.
+    one draw of :math:`\varepsilon \sim N(0, I)` per action.
 
     Args:
-        actions: undisturbed, in [-1, 1], shape ``(N, action_dim)``.
-        size: mean norm of the deviation that is asked for.
-        seed: of the draws.
+        actions: actions without noise, in [-1, 1], shape ``(N, action_dim)``.
+        size: mean norm of the deviation.
+        seed: seed of the draws.
 
     Raises:
-        BMRLError: if no noise within the bounds moves them so far.
+        BMRLError: if no noise within the bounds causes such a deviation.
 
     Example:
         >>> sigma = matching_noise(np.zeros((10_000, 1)), 0.08)  # E|ε| is 0.80

@@ -1,10 +1,10 @@
-"""What the embedding m knows of a task: its stages, and the distance to its goal.
+"""Measures of the task embedding m: stages of a task, and distance to its goal.
 
-Distances are measured on transitions up to the first that succeeds (:func:`until_success`), stages
-on :data:`STAGE_TAIL` steps more: after that an expert holds still, for most of an episode, and what
-an action's noise does there is neither a stage nor a way.
+Distances are measured on transitions up to the first success (:func:`until_success`), stages on
+:data:`STAGE_TAIL` steps more. After that an expert holds still for most of an episode, and its
+action noise is neither a stage nor progress.
 
-Needs scipy and scikit-learn, of the ``[reports]`` extra.
+Needs scipy and scikit-learn from the ``[reports]`` extra.
 """
 
 from __future__ import annotations
@@ -17,27 +17,30 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.evaluation.behaviour import spread
 from torchrl_bmrl.evaluation.statistics import Estimate, bootstrap_interval
 from torchrl_bmrl.extras import needs
 
 STAGE_TAIL = 10
-"""Steps after success that count as the last stage, half a second.
+"""Steps after success that still belong to the last stage (half a second at 20 Hz).
 
-A task succeeds as soon as its last stage has got far enough: cut there, a lift's last stage is a
-third as long as the others.
+A task succeeds in the middle of its last stage. Without these steps, the last stage of a lift would
+be a third as long as the others.
 """
+
+_RESAMPLES = 200
 
 
 @dataclass(frozen=True, kw_only=True)
 class StageResult:
-    """How far the groups that were found in a task agree with its recorded phases.
+    """Agreement of the groups found in a task's transitions with its recorded phases.
 
     Attributes:
-        task: its name.
+        task: name of the task.
         phases: names of the phases.
-        agreement: adjusted mutual information by what the groups were found in.
+        agreement: adjusted mutual information by representation.
         episodes: number of held-out episodes.
-        transitions: number of their transitions on the way.
+        transitions: number of their transitions.
 
     Example:
         >>> result = StageResult(
@@ -60,16 +63,16 @@ class StageResult:
 
 @dataclass(frozen=True, kw_only=True)
 class GoalDistanceResult:
-    """How far distances to a task's success point tell the distance to its goal.
+    """Correlation of the distance to a task's success point with the distance to its goal.
 
     Attributes:
-        task: its name.
-        correlation: Spearman's, mean over episodes, by what the distances are taken in.
+        task: name of the task.
+        correlation: Spearman's correlation, mean over episodes, by representation.
         lowest: lowest of the episodes' correlations in the embedding.
-        spread: of the embeddings at success, over that at the start; ``None`` without two
-            successful episodes.
+        spread: spread of the embeddings at success divided by their spread at the start; ``None``
+            if fewer than two episodes succeed.
         episodes: number of held-out episodes.
-        transitions: number of their transitions on the way.
+        transitions: number of their transitions up to success.
 
     Example:
         >>> result = GoalDistanceResult(
@@ -95,19 +98,19 @@ class GoalDistanceResult:
 def until_success(
     success: ArrayLike, episode: ArrayLike, step: ArrayLike, *, tail: int = 0
 ) -> NDArray[np.bool_]:
-    """Which transitions lie on the way: those up to and with the first that succeeds.
+    """Selects the transitions of each episode up to and including its first success.
 
     Args:
         success: Whether a transition meets the task's goal, shape ``(N,)``.
         episode: Episode within the task, shape ``(N,)``, in any order.
         step: Step within the episode, shape ``(N,)``.
-        tail: So many steps after the success are on the way, too.
+        tail: Number of steps after the success that are also selected.
 
     Returns:
-        Mask, shape ``(N,)``. An episode without success is on the way to its end.
+        Mask, shape ``(N,)``. All of an episode without success is selected.
 
     Raises:
-        BMRLError: if the shapes do not fit.
+        BMRLError: if the shapes differ.
 
     Example:
         >>> until_success([0, 1, 0, 1], episode=[0, 0, 0, 0], step=[0, 1, 2, 3]).tolist()
@@ -115,35 +118,35 @@ def until_success(
     """
     success, episode, step = np.asarray(success, bool), np.asarray(episode), np.asarray(step)
     _check_rows(len(np.atleast_1d(success)), success=success, episode=episode, step=step)
-    on_the_way = np.ones(success.shape, dtype=bool)
+    selected = np.ones(success.shape, dtype=bool)
     for number in np.unique(episode):
         rows = episode == number
         if success[rows].any():
-            on_the_way[rows] = step[rows] <= step[rows & success].min() + tail
-    return on_the_way
+            selected[rows] = step[rows] <= step[rows & success].min() + tail
+    return selected
 
 
 def find_stages(
     training: ArrayLike, points: ArrayLike, num_stages: int, *, seed: int = 0
 ) -> NDArray[np.int64]:
-    """Groups transitions of a task into stages, without being told any.
+    """Groups transitions of a task into stages, without labels.
 
-    A mixture of Gaussians with full covariances is fitted to the training transitions and names the
-    component of each point. Stages are stretched along an episode's way and differ in size, which
-    k-means, made for round clusters of one size, cuts across.
+    A mixture of Gaussians with full covariances is fitted to the training transitions, and each
+    point gets its most likely component. Stages are stretched along the trajectory and differ in
+    size; k-means assumes round clusters of one size and would cut across them.
 
     Args:
-        training: What the groups are found in, shape ``(M, d)``.
-        points: What is grouped, shape ``(N, d)``.
+        training: Transitions that the mixture is fitted to, shape ``(M, d)``.
+        points: Transitions that are grouped, shape ``(N, d)``.
         num_stages: Number of groups.
-        seed: Seed of the fit; equal arguments give equal groups.
+        seed: Seed of the fit.
 
     Returns:
-        Group of each point, shape ``(N,)``, in [0, num_stages). There are fewer groups where fewer
-        training points differ.
+        Group of each point, shape ``(N,)``, in [0, num_stages). There are fewer groups if there are
+        fewer distinct training points.
 
     Raises:
-        BMRLError: if the points are not finite or of differing sizes, or fewer than the groups.
+        BMRLError: if the points are not finite, differ in size, or are fewer than the groups.
 
     Example:
         >>> line = np.array([[0.0], [0.1], [0.2], [5.0], [5.1], [5.2]])
@@ -166,19 +169,19 @@ def find_stages(
         )
     if is_one_point(training):
         return np.zeros(len(points), dtype=np.int64)
-    # In units of the points' spread, so that reg_covar means the same for every embedding.
-    loc, spread = training.mean(0), float(training.std())
-    training, points = (training - loc) / spread, (points - loc) / spread
+    # Scaled by the points' spread, so that reg_covar has the same effect for every embedding.
+    loc, scale = training.mean(0), float(training.std())
+    training, points = (training - loc) / scale, (points - loc) / scale
     groups = min(num_stages, len(np.unique(training, axis=0)))
     mixture = GaussianMixture(groups, n_init=5, reg_covar=1e-5, random_state=seed)
-    # Several threads add up in an order that changes from run to run.
+    # With several threads the order of sums, and so the result, would vary from run to run.
     with threadpool_limits(limits=1):
         mixture.fit(training)
         return mixture.predict(points).astype(np.int64)
 
 
 def is_one_point(points: NDArray[np.floating[Any]]) -> bool:
-    """Whether points are all the same but for rounding.
+    """Whether all points are equal up to rounding.
 
     Args:
         points: shape ``(N, d)``.
@@ -193,26 +196,25 @@ def is_one_point(points: NDArray[np.floating[Any]]) -> bool:
 
 
 def stage_agreement(
-    stage: ArrayLike, phase: ArrayLike, episode: ArrayLike, *, resamples: int = 200, seed: int = 0
+    stage: ArrayLike, phase: ArrayLike, episode: ArrayLike, *, seed: int = 0
 ) -> Estimate:
     """Adjusted mutual information of groups and recorded phases.
 
-    It is 1 where either tells the other, 0 on average where they are drawn independently, whatever
-    their numbers and sizes are, and does not look at which group has which name.
+    It is 1 if either determines the other and 0 on average if they are independent, for any number
+    and size of groups. It does not depend on the groups' numbering.
 
     Args:
         stage: Group of each transition, shape ``(N,)``.
         phase: Recorded phase of each transition, shape ``(N,)``.
-        episode: Episode of each transition, shape ``(N,)``: what is resampled, as transitions of
-            one episode are not independent.
-        resamples: Number of bootstrap resamples.
+        episode: Episode of each transition, shape ``(N,)``. Episodes are resampled, because
+            transitions of one episode are not independent.
         seed: Seed of the resampling.
 
     Returns:
         Adjusted mutual information, normalised by the mean entropy, and its interval.
 
     Raises:
-        BMRLError: if there is no transition or the shapes do not fit.
+        BMRLError: if there is no transition or the shapes differ.
 
     Example:
         >>> print(stage_agreement([1, 1, 0, 0], [0, 0, 2, 2], episode=[0, 1, 0, 1]))
@@ -226,7 +228,6 @@ def stage_agreement(
     return _over_episodes(
         lambda rows: float(adjusted_mutual_info_score(phase[rows], stage[rows])),
         episode,
-        resamples=resamples,
         seed=seed,
     )
 
@@ -234,20 +235,20 @@ def stage_agreement(
 def distance_correlations(
     task_latent: ArrayLike, success_point: ArrayLike, distance: ArrayLike, episode: ArrayLike
 ) -> NDArray[np.float64]:
-    """Rank correlation, in each episode, of the distances in the embedding and in the world.
+    """Rank correlation, in each episode, of distances in the embedding and distances to the goal.
 
     Args:
         task_latent: Embeddings m, shape ``(N, d)``.
-        success_point: Where the task succeeds in the embedding, shape ``(d,)``.
-        distance: End effector to goal, shape ``(N,)``, [m].
+        success_point: Point of the embedding where the task succeeds, shape ``(d,)``.
+        distance: Distance to the goal, shape ``(N,)``, [m].
         episode: Episode of each transition, shape ``(N,)``.
 
     Returns:
-        Spearman's correlation of each episode, in their order, shape ``(E,)``; 0 where an episode
-        has a single transition or one of the distances never changes, since nothing is told then.
+        Spearman's correlation of each episode, in their order, shape ``(E,)``. It is 0 if an
+        episode has a single transition or one of the distances is constant.
 
     Raises:
-        BMRLError: if there is no transition, the shapes do not fit or a number is not finite.
+        BMRLError: if there is no transition, the shapes differ or a number is not finite.
 
     Example:
         >>> way = np.array([[3.0, 0.0], [0.0, 2.0], [0.5, 0.0]])
@@ -263,31 +264,28 @@ def distance_correlations(
             "as an embedding has"
         )
     if not np.isfinite(distance).all():
-        raise BMRLError("distance must be finite; it holds NaN or infinite values")
+        raise BMRLError("distance must be finite; it contains NaN or infinite values")
     away = np.linalg.norm(latent - point, axis=1)
     return np.array(
         [_spearman(away[episode == n], distance[episode == n]) for n in np.unique(episode)]
     )
 
 
-def spread_ratio(
-    start: ArrayLike, end: ArrayLike, *, resamples: int = 200, seed: int = 0
-) -> Estimate:
-    """How far apart episodes end in the embedding, over how far apart they start.
+def spread_ratio(start: ArrayLike, end: ArrayLike, *, seed: int = 0) -> Estimate:
+    """Spread of episodes in the embedding at their end divided by the spread at their start.
 
-    The spread of points is the root of their mean squared distance from their mean.
+    The spread of points is the root mean square distance from their mean.
 
     Args:
         start: Embedding of each episode's first transition, shape ``(E, d)``.
         end: Embedding of each episode's first success, shape ``(E, d)``.
-        resamples: Number of bootstrap resamples.
         seed: Seed of the resampling.
 
     Returns:
-        Ratio and its interval; below 1 the episodes come together.
+        Ratio and its interval; below 1 the episodes converge.
 
     Raises:
-        BMRLError: if the shapes do not fit, a number is not finite, or all start in one point.
+        BMRLError: if the shapes differ, a number is not finite, or all start in one point.
 
     Example:
         >>> spread_ratio([[0.0], [4.0]], [[1.0], [2.0]]).value
@@ -298,23 +296,23 @@ def spread_ratio(
         raise BMRLError(f"end has the shape {end.shape}; valid: {start.shape}, as start has")
 
     def ratio(rows: NDArray[np.integer[Any]]) -> float:
-        before = _spread(start[rows])
-        return _spread(end[rows]) / before if before > 0.0 else np.nan
+        before = spread(start[rows])
+        return spread(end[rows]) / before if before > 0.0 else np.nan
 
     if np.isnan(ratio(np.arange(len(start)))):
         raise BMRLError(f"start is one point {len(start)} times; valid: at least two that differ")
-    return _over_episodes(ratio, np.arange(len(start)), resamples=resamples, seed=seed)
+    return _over_episodes(ratio, np.arange(len(start)), seed=seed)
 
 
 def mean_estimate(values: ArrayLike, *, seed: int = 0) -> Estimate:
-    """Mean over episodes with its interval.
+    """Mean over episodes with its bootstrap interval.
 
     Args:
         values: One number per episode, shape ``(E,)``.
         seed: Seed of the resampling.
 
     Raises:
-        BMRLError: if there is none, or one is not finite.
+        BMRLError: if there is no number, or one is not finite.
 
     Example:
         >>> print(mean_estimate([0.5, 0.5]))
@@ -328,13 +326,12 @@ def _over_episodes(
     statistic: Callable[[NDArray[np.integer[Any]]], float],
     episode: NDArray[np.integer[Any]],
     *,
-    resamples: int,
     seed: int,
 ) -> Estimate:
-    """A statistic of rows, and its percentile interval with whole episodes drawn anew."""
+    """Evaluates a statistic of rows, with a percentile interval over resampled episodes."""
     groups = [np.flatnonzero(episode == number) for number in np.unique(episode)]
     rng = np.random.default_rng(seed)
-    draws = rng.integers(len(groups), size=(resamples, len(groups)))
+    draws = rng.integers(len(groups), size=(_RESAMPLES, len(groups)))
     drawn = [statistic(np.concatenate([groups[i] for i in draw])) for draw in draws]
     low, high = np.nanquantile(drawn, [0.025, 0.975])
     value = statistic(np.arange(len(episode)))
@@ -350,16 +347,12 @@ def _spearman(first: NDArray[Any], second: NDArray[Any]) -> float:
     return float(spearmanr(first, second).statistic)
 
 
-def _spread(points: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.square(points - points.mean(0)).sum(1).mean()))
-
-
 def _check_points(name: str, points: ArrayLike) -> NDArray[np.float64]:
     array = np.asarray(points, dtype=np.float64)
     if array.ndim != 2 or 0 in array.shape:
         raise BMRLError(f"{name} has the shape {array.shape}; valid: (N, d), neither of them 0")
     if not np.isfinite(array).all():
-        raise BMRLError(f"{name} must be finite; it holds NaN or infinite values")
+        raise BMRLError(f"{name} must be finite; it contains NaN or infinite values")
     return array
 
 

@@ -1,4 +1,4 @@
-"""Paths through the embedding: straight ones, and ones that keep to where data is."""
+"""Paths through the embedding: straight lines, and paths that stay close to data."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torchrl_bmrl.extras import needs
 
 
 class PathError(BMRLError):
-    """A path between points that are of different dimension, not finite, or too few.
+    """The points of a path have different dimensions, are not finite, or are too few.
 
     Example:
         >>> straight_path([0.0, 0.0], [1.0], 3)
@@ -21,7 +21,7 @@ class PathError(BMRLError):
 
 
 def straight_path(start: ArrayLike, end: ArrayLike, num_points: int) -> NDArray[np.float64]:
-    """Points of the straight line between two points, at equal distances.
+    """Returns points at equal distances on the straight line between two points.
 
     Args:
         start: first point, shape ``(m,)``.
@@ -32,7 +32,7 @@ def straight_path(start: ArrayLike, end: ArrayLike, num_points: int) -> NDArray[
         shape ``(num_points, m)``.
 
     Raises:
-        PathError: if the points do not fit each other, or there are too few.
+        PathError: if the dimensions differ, or there are too few points.
 
     Example:
         >>> straight_path([0.0, 1.0], [1.0, 1.0], 3).tolist()
@@ -45,22 +45,22 @@ def straight_path(start: ArrayLike, end: ArrayLike, num_points: int) -> NDArray[
 def data_path(
     data: ArrayLike, start: ArrayLike, end: ArrayLike, num_points: int, *, power: float = 3.0
 ) -> NDArray[np.float64]:
-    r"""Points at equal distances along the path between two points that keeps to data.
+    r"""Returns points at equal distances on a path between two points that stays close to data.
 
-    The shortest path :math:`x_0, \ldots, x_n` over data points when a hop costs more than in
-    proportion to its length,
+    It is the shortest path :math:`x_0, \ldots, x_n` over data points when a hop costs the p-th
+    power of its length,
 
     .. math:: \min \textstyle\sum_i \lVert x_{i+1} - x_i \rVert^p,
 
-    so that many short hops, where data is dense, beat one long hop across a gap. Unlike on a graph
-    of nearest neighbours there always is such a path, and no number of neighbours to choose.
+    so that many short hops through dense data cost less than one long hop across a gap. Unlike a
+    graph of nearest neighbours, this always has a path and needs no number of neighbours.
 
     Reference: Bijral et al. 2012, *Semi-supervised learning with density based distances*,
     https://arxiv.org/abs/1202.3702.
 
     Args:
-        data: points that the path may use, shape ``(N, m)``; memory grows with their square (8 MB
-            for a thousand).
+        data: points that the path may use, shape ``(N, m)``; memory grows with N² (8 MB for a
+            thousand).
         start: first point, shape ``(m,)``.
         end: last point, shape ``(m,)``.
         num_points: at least 2.
@@ -70,7 +70,7 @@ def data_path(
         shape ``(num_points, m)``.
 
     Raises:
-        PathError: if the points do not fit each other, there are too few, or p is below 1.
+        PathError: if the dimensions differ, there are too few points, or p is below 1.
 
     Example:
         >>> corner = [[0.0, 0.5], [0.0, 1.0], [0.5, 1.0]]
@@ -80,18 +80,18 @@ def data_path(
     if power < 1:
         raise PathError(f"power is {power}; valid: at least 1")
     first, last, between = _points(start, end, data, num_points)
-    # Imported here, as scipy.stats is by its neighbours: processes that only roll out do without.
+    # Imported here because a process that only plays episodes does not need scipy.
     with needs("reports"):
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import dijkstra
         from scipy.spatial.distance import cdist
 
-    # Equal points would have hops of cost 0, which csgraph reads as no hop.
+    # A hop between equal points would cost 0, which csgraph takes for a missing edge.
     nodes = np.unique(np.vstack([first, last, between]), axis=0)
     source, target = (int(np.flatnonzero((nodes == x).all(1))[0]) for x in (first, last))
     length = cdist(nodes, nodes)
-    # Of the longest, so that none is too small for its power. In a dense array csgraph takes costs
-    # below 1e-8 for no hops, too.
+    # Relative to the longest hop, so that no power underflows. In a dense array csgraph would take
+    # costs below 1e-8 for missing edges, too.
     cost = csr_array((length / (length.max() or 1.0)) ** power)
     _, before = dijkstra(cost, indices=source, return_predecessors=True)
     route = [target]
@@ -107,19 +107,19 @@ def data_path(
 def switched_path(
     first: ArrayLike, second: ArrayLike, *, at: int, steps: int
 ) -> NDArray[np.float64]:
-    """One sequence of embeddings up to a step, a straight line, then another sequence.
+    """Joins two sequences of embeddings by a straight line.
 
     Args:
-        first: shape ``(T, m)``; its first ``at`` points are kept.
-        second: shape ``(T, m)``; its points from ``at + steps`` on are kept.
+        first: shape ``(T, m)``; its first ``at`` points are used.
+        second: shape ``(T, m)``; its points from ``at + steps`` on are used.
         at: step of the line's first point, at least 1.
-        steps: points of the line between the two.
+        steps: number of points on the line.
 
     Returns:
         shape ``(T, m)``.
 
     Raises:
-        PathError: if the sequences do not fit each other, or end before the line does.
+        PathError: if the shapes differ, or the line does not end within the sequences.
 
     Example:
         >>> switched_path(np.zeros((5, 1)), np.ones((5, 1)), at=2, steps=1).ravel().tolist()

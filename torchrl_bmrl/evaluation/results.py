@@ -1,4 +1,4 @@
-"""``results.csv``: one row per evaluated episode, from which every table is computed."""
+"""``results.csv``: one row per evaluated episode. Every table is computed from it."""
 
 from __future__ import annotations
 
@@ -14,16 +14,7 @@ import numpy as np
 
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.evaluation.statistics import bootstrap_interval
-from torchrl_bmrl.files import (
-    finite,
-    flag,
-    one_of,
-    parse_row,
-    read_rows,
-    whole,
-    write_atomic,
-)
-from torchrl_bmrl.names import TASKS
+from torchrl_bmrl.files import finite, flag, parse_row, read_rows, whole, write_atomic
 
 POLICIES: tuple[str, ...] = (
     "expert",
@@ -35,18 +26,41 @@ POLICIES: tuple[str, ...] = (
     "cql",
     "bcq_one_hot",
 )
-"""The policies that a run compares, in the order of the tables."""
+"""Policies that come first in tables, in this order; any other name follows, sorted."""
+
+
+def name(text: str) -> str:
+    """A name: any text that is not empty.
+
+    Raises:
+        ValueError: if the text is empty.
+
+    Example:
+        >>> name("lift")
+        'lift'
+    """
+    if not text:
+        raise ValueError("a name")
+    return text
+
+
+def _optional_flag(text: str) -> bool | None:
+    try:
+        return flag(text) if text else None
+    except ValueError as error:
+        raise ValueError(f"{error}, or nothing if unknown") from None
+
 
 RESULT_COLUMNS: Mapping[str, Callable[[str], Any]] = {
-    "task": one_of(*TASKS),
-    "policy": one_of(*POLICIES),
+    "task": name,
+    "policy": name,
     "latent_source": str,
     "seed": whole,
     "episode": whole,
     "return": finite,
-    "success": flag,
+    "success": _optional_flag,
 }
-"""Columns of ``results.csv``, and what makes a value of a text."""
+"""Columns of ``results.csv`` and the parser of each."""
 RESULT_FIELDS: tuple[str, ...] = tuple(RESULT_COLUMNS)
 """Names of the columns of ``results.csv``, in their order."""
 
@@ -56,13 +70,14 @@ class ResultRow:
     """One evaluated episode.
 
     Args:
-        task: One of :data:`torchrl_bmrl.names.TASKS`.
-        policy: One of :data:`POLICIES`.
+        task: Name of the task.
+        policy: Name of the policy, such as one of :data:`POLICIES`.
         latent_source: Where the distilled policy took ``task_latent`` from; empty for the others.
         seed: Seed of the training run that the policy comes from.
         episode: Number of the episode within its task, policy, source and seed.
         episode_return: Undiscounted sum of the rewards (column ``return``).
-        success: Whether the task's goal was met at some step.
+        success: Whether the task succeeded at some step; ``None`` (an empty cell) if the task
+            does not define success.
 
     Example:
         >>> row = ResultRow(
@@ -78,23 +93,23 @@ class ResultRow:
     seed: int
     episode: int
     episode_return: float
-    success: bool
+    success: bool | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """All episodes of one task, policy and source of ``task_latent``.
+    """Statistics of all episodes of one task, policy and source of ``task_latent``.
 
     Args:
-        task: One of :data:`torchrl_bmrl.names.TASKS`.
-        policy: One of :data:`POLICIES`.
-        latent_source: Empty but for the distilled policy.
+        task: Name of the task.
+        policy: Name of the policy.
+        latent_source: Where ``task_latent`` came from; empty for all but the distilled policy.
         episodes: Number of episodes, over all seeds.
         seeds: Number of different seeds.
         mean_return: Mean return over the episodes.
         std_return: Standard deviation over the episodes (n - 1 in the denominator; 0 for one).
         return_interval: 95% bootstrap interval of the mean return, stratified by seed.
-        success_rate: Share of successful episodes, in [0, 1].
+        success_rate: Share of successful episodes, in [0, 1]; ``None`` if success is unknown.
         success_interval: 95% bootstrap interval of the success rate, stratified by seed.
 
     Example:
@@ -117,12 +132,12 @@ class Summary:
     mean_return: float
     std_return: float
     return_interval: tuple[float, float]
-    success_rate: float
-    success_interval: tuple[float, float]
+    success_rate: float | None
+    success_interval: tuple[float, float] | None
 
 
 def read_results(path: str | os.PathLike[str]) -> list[ResultRow]:
-    """Reads a ``results.csv``; columns beyond :data:`RESULT_FIELDS` are ignored.
+    """Reads a ``results.csv`` and ignores columns other than :data:`RESULT_FIELDS`.
 
     Args:
         path: The file.
@@ -131,8 +146,7 @@ def read_results(path: str | os.PathLike[str]) -> list[ResultRow]:
         The rows in the file's order.
 
     Raises:
-        DataError: if the file or a column is missing, or a value is not valid; the message names
-            the file, line, column, value and what is valid.
+        DataError: if the file or a column is missing, or a value is not valid.
 
     Example:
         >>> import tempfile
@@ -149,18 +163,19 @@ def read_results(path: str | os.PathLike[str]) -> list[ResultRow]:
 
 
 def result_row(values: Mapping[str, Any], path: Path, line: int) -> ResultRow:
-    """The row of the values of :data:`RESULT_COLUMNS`.
+    """Makes a row from the parsed values of one line.
 
     Args:
-        values: By column.
-        path: The file that they are from, for the message.
-        line: Number of the line in it, for the message.
+        values: Values by column (:data:`RESULT_COLUMNS`).
+        path: The file, for the message.
+        line: Number of the line, for the message.
 
     Raises:
-        DataError: if the distilled policy has no source of ``task_latent``, or another one has.
+        DataError: if the distilled policy has no source of ``task_latent``, or another policy of
+            :data:`POLICIES` has one.
     """
     policy, source = values["policy"], values["latent_source"]
-    if (policy == "distilled") != bool(source):
+    if policy in POLICIES and (policy == "distilled") != bool(source):
         expected = "a source's name" if policy == "distilled" else "nothing"
         message = f"value in line {line} is {source!r}; expected {expected} for policy {policy}"
         raise DataError(path, "latent_source", message)
@@ -169,14 +184,14 @@ def result_row(values: Mapping[str, Any], path: Path, line: int) -> ResultRow:
 
 
 def write_results(path: str | os.PathLike[str], rows: Iterable[ResultRow]) -> None:
-    """Writes a ``results.csv`` atomically; reading it gives the same rows, returns bit by bit.
+    """Writes a ``results.csv`` atomically; reading it returns exactly the same rows.
 
     Args:
         path: The file to write or replace.
         rows: The episodes.
 
     Raises:
-        DataError: if :func:`read_results` would refuse a row; the old file then stays.
+        DataError: if a row is not valid; an existing file is then left as it was.
 
     Example:
         >>> import tempfile
@@ -196,24 +211,24 @@ def write_results(path: str | os.PathLike[str], rows: Iterable[ResultRow]) -> No
             "latent_source": row.latent_source,
             "seed": str(int(row.seed)),
             "episode": str(int(row.episode)),
-            # repr of a Python float is the shortest text that reads back as the same float.
+            # repr of a Python float is the shortest text that parses to the same float.
             "return": repr(float(row.episode_return)),
-            "success": str(int(row.success)),
+            "success": "" if row.success is None else str(int(row.success)),
         }
         result_row(parse_row(record, RESULT_COLUMNS, path, line), path, line)
         writer.writerow(record)
     write_atomic(path, text.getvalue())
 
 
-def summarise(rows: Iterable[ResultRow]) -> list[Summary]:
-    """One summary per task, policy and source of ``task_latent``.
+def summarise(rows: Iterable[ResultRow], tasks: Iterable[str] = ()) -> list[Summary]:
+    """Computes one summary per task, policy and source of ``task_latent``.
 
     Args:
-        rows: Episodes in any order; the order does not change a number.
+        rows: Episodes; their order within a group does not change a number.
+        tasks: Order of the tasks; tasks that are not in it follow in the order of the rows.
 
     Returns:
-        Summaries in the order of :data:`torchrl_bmrl.names.TASKS`, then :data:`POLICIES`, then
-        sources by name.
+        Summaries in the order of the tasks, then of :func:`policy_order`, then sources by name.
 
     Example:
         >>> rows = [
@@ -229,16 +244,30 @@ def summarise(rows: Iterable[ResultRow]) -> list[Summary]:
     groups: dict[tuple[str, str, str], list[ResultRow]] = {}
     for row in rows:
         groups.setdefault((row.task, row.policy, row.latent_source), []).append(row)
-    order = sorted(groups, key=lambda key: (TASKS.index(key[0]), POLICIES.index(key[1]), key[2]))
+    place = {task: i for i, task in enumerate(dict.fromkeys([*tasks, *(key[0] for key in groups)]))}
+    order = sorted(groups, key=lambda key: (place[key[0]], *policy_order(key[1]), key[2]))
     return [_summary(key, groups[key]) for key in order]
 
 
+def policy_order(policy: str) -> tuple[int, str]:
+    """Sort key of a policy's name: those of :data:`POLICIES` first, then the others by name.
+
+    Example:
+        >>> sorted(["mine", "bcq", "expert"], key=policy_order)
+        ['expert', 'bcq', 'mine']
+    """
+    return POLICIES.index(policy) if policy in POLICIES else len(POLICIES), policy
+
+
 def _summary(key: tuple[str, str, str], rows: list[ResultRow]) -> Summary:
-    # Resampling picks by position, so a fixed order makes the intervals independent of the file's.
-    rows = sorted(rows, key=lambda row: (row.seed, row.episode, row.episode_return, row.success))
+    # The bootstrap draws by position: sorting makes the intervals independent of the rows' order.
+    rows = sorted(
+        rows, key=lambda row: (row.seed, row.episode, row.episode_return, bool(row.success))
+    )
     seeds = [row.seed for row in rows]
     returns = np.array([row.episode_return for row in rows], dtype=np.float64)
-    successes = np.array([row.success for row in rows], dtype=np.float64)
+    outcomes = [row.success for row in rows]
+    successes = None if None in outcomes else np.array(outcomes, dtype=np.float64)
     return Summary(
         task=key[0],
         policy=key[1],
@@ -248,6 +277,6 @@ def _summary(key: tuple[str, str, str], rows: list[ResultRow]) -> Summary:
         mean_return=float(returns.mean()),
         std_return=float(returns.std(ddof=1)) if len(rows) > 1 else 0.0,
         return_interval=bootstrap_interval(returns, strata=seeds),
-        success_rate=float(successes.mean()),
-        success_interval=bootstrap_interval(successes, strata=seeds),
+        success_rate=None if successes is None else float(successes.mean()),
+        success_interval=None if successes is None else bootstrap_interval(successes, strata=seeds),
     )

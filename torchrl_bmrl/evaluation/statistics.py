@@ -1,4 +1,4 @@
-"""Intervals for means of a few episodes, and for what sets two policies apart."""
+"""Bootstrap intervals of means over episodes and of differences between two policies."""
 
 from __future__ import annotations
 
@@ -13,15 +13,19 @@ from numpy.typing import ArrayLike, NDArray
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.extras import needs
 
+RESAMPLES = 2000
+"""Number of bootstrap resamples."""
+_CONFIDENCE = 0.95
+
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """A number and the interval that other episodes would have moved it in.
+    """A measured number with its 95% bootstrap interval over episodes.
 
     Attributes:
-        value: what was measured.
-        low: lower end of the 95% bootstrap interval over episodes.
-        high: upper end.
+        value: the number.
+        low: lower end of the interval.
+        high: upper end of the interval.
 
     Example:
         >>> print(Estimate(value=0.5, low=0.4, high=0.6))
@@ -33,7 +37,7 @@ class Estimate:
     high: float
 
     def __str__(self) -> str:
-        """The number and its interval, as tables print them."""
+        """Returns the number and its interval as tables print them."""
         return f"{self.value:.2f} [{self.low:.2f}, {self.high:.2f}]"
 
 
@@ -41,35 +45,30 @@ def bootstrap_interval(
     values: ArrayLike,
     *,
     strata: ArrayLike | None = None,
-    confidence: float = 0.95,
-    resamples: int = 2000,
     seed: int = 0,
 ) -> tuple[float, float]:
-    r"""Percentile bootstrap interval of the mean, optionally stratified.
+    r"""Computes the 95% percentile bootstrap interval of the mean, optionally stratified.
 
-    Every stratum :math:`s` is resampled with replacement on its own, at its own size :math:`n_s`,
-    and the statistic is the mean over all values,
+    Each stratum :math:`s` is resampled with replacement at its own size :math:`n_s`, and the
+    statistic is the mean over all values,
 
     .. math:: \bar x^* = \frac{1}{N} \sum_s \sum_{i=1}^{n_s} x^*_{s,i}.
 
-    With the training seed as the stratum, every resample holds as many episodes of each seed as
-    were evaluated: the interval tells how far the mean of these trained policies would move with
-    other episodes, not with other seeds.
+    With the training seed as the stratum, the interval shows how far the mean of these trained
+    policies would move with other episodes, not with other training seeds.
 
     Args:
         values: Sample, shape ``(N,)``; returns, or successes as 0 and 1.
         strata: Label of each value's stratum, shape ``(N,)``; ``None`` is one stratum.
-        confidence: Coverage asked for, in (0, 1).
-        resamples: Number of bootstrap resamples.
-        seed: Seed of the resampling; equal arguments give the equal interval.
+        seed: Seed of the resampling.
 
     Returns:
-        Lower and upper end. Where no stratum holds two different values (a single episode, 20 of
-        20 successes) resampling cannot move the mean, and both ends are the mean.
+        Lower and upper end. Both are the mean if no stratum contains two different values (a
+        single episode, 20 of 20 successes), because resampling cannot move the mean then.
 
     Raises:
-        BMRLError: if ``values`` is empty, not a vector or not finite, or ``strata`` or
-            ``confidence`` does not fit.
+        BMRLError: if ``values`` is empty, not a vector or not finite, or ``strata`` has another
+            shape.
 
     Example:
         >>> low, high = bootstrap_interval([1.0, 0.0, 1.0, 1.0])
@@ -82,15 +81,14 @@ def bootstrap_interval(
     groups = [sample[rows] for rows in _split(len(sample), strata)]
     moving = [group for group in groups if np.ptp(group) > 0.0]
     if not moving:
-        _check_confidence(confidence)
         return float(sample.mean()), float(sample.mean())
-    # scipy refuses strata of one value; constant strata add the same sum to every resample.
+    # scipy refuses strata of one value; a constant stratum adds the same sum to every resample.
     fixed = sum(float(group.sum()) for group in groups if np.ptp(group) == 0.0)
 
     def mean(*resampled: NDArray[np.float64], axis: int) -> Any:
         return (fixed + sum(group.sum(axis=axis) for group in resampled)) / sample.size
 
-    return _percentiles(moving, mean, confidence=confidence, resamples=resamples, seed=seed)
+    return _percentiles(moving, mean, seed=seed)
 
 
 def relative_difference(
@@ -99,34 +97,28 @@ def relative_difference(
     *,
     strata: ArrayLike | None = None,
     groups: ArrayLike | None = None,
-    confidence: float = 0.95,
-    resamples: int = 2000,
-    seed: int = 0,
 ) -> Estimate:
-    r"""How much more one policy returns than another on the same starts, as a share of the other.
+    r"""Relative difference of two policies' mean returns on the same starts.
 
     .. math:: \delta = \frac{1}{G} \sum_g \frac{\bar x_g - \bar y_g}{\bar y_g}
 
-    with one group, or with the task as the group: the mean over tasks of a task's difference.
+    There is one group, or one group per task; then the result is the mean over tasks.
 
-    The interval is a percentile bootstrap over pairs: ``x[i]`` and ``y[i]`` are episodes from the
-    same start and are drawn together, so that a difficult start does not count as a difference.
-    Within a group, every stratum is resampled on its own, at its own size, as in
-    :func:`bootstrap_interval`. Resamples in which a group's mean of ``y`` is not positive, as where
-    few episodes have a reward, have no difference and are left out.
+    The interval is a 95% percentile bootstrap over pairs: ``x[i]`` and ``y[i]`` are episodes from
+    the same start and are drawn together, so that a difficult start does not count as a
+    difference. Each stratum of a group is resampled at its own size, as in
+    :func:`bootstrap_interval`. A resample in which a group's mean of ``y`` is not positive has no
+    relative difference and is left out.
 
     Args:
-        x: Returns of the one policy, shape ``(N,)``.
-        y: Returns of the other on the same starts in the same order, shape ``(N,)``.
+        x: Returns of the first policy, shape ``(N,)``.
+        y: Returns of the second policy on the same starts in the same order, shape ``(N,)``.
         strata: Label of each pair's stratum, the training seed, shape ``(N,)``.
         groups: Label of each pair's group, shape ``(N,)``; ``None`` is one group.
-        confidence: Coverage asked for, in (0, 1).
-        resamples: Number of bootstrap resamples.
-        seed: Seed of the resampling; the order of the pairs does not matter.
 
     Raises:
         BMRLError: if the values are not two finite vectors of the same length, a group's mean of
-            ``y`` is not positive, or an option does not fit.
+            ``y`` is not positive, or the labels have another shape.
 
     Example:
         >>> relative_difference([110.0, 220.0], [100.0, 200.0])
@@ -136,7 +128,7 @@ def relative_difference(
     if len(ours) != len(theirs):
         raise BMRLError(f"x and y are pairs; got {len(ours)} and {len(theirs)} values")
     layers = _split(len(ours), strata)
-    parts = []  # of each group, the rows of its strata in an order that their own is lost in
+    parts = []  # per group, the rows of its strata, sorted so that the given order has no effect
     for rows in _split(len(ours), groups):
         split = [part for layer in layers if len(part := np.intersect1d(rows, layer))]
         parts.append([part[np.lexsort((theirs[part], ours[part]))] for part in split])
@@ -154,7 +146,7 @@ def relative_difference(
         return sum(ratios) / len(ratios)
 
     sizes = [len(part) for group in parts for part in group]
-    return _estimate(sizes, difference, confidence=confidence, resamples=resamples, seed=seed)
+    return _estimate(sizes, difference)
 
 
 def probability_of_improvement(
@@ -163,33 +155,26 @@ def probability_of_improvement(
     *,
     x_strata: ArrayLike | None = None,
     y_strata: ArrayLike | None = None,
-    confidence: float = 0.95,
-    resamples: int = 2000,
-    seed: int = 0,
 ) -> Estimate:
-    r"""Probability that an episode of one policy returns more than an episode of another.
+    r"""Probability of improvement: how often an episode of one policy returns more than another's.
 
     .. math::
         P(X > Y) = \frac{1}{S} \sum_s \frac{1}{n_s m_s} \sum_{i, j}
         [x_{s,i} > y_{s,j}] + \tfrac{1}{2} [x_{s,i} = y_{s,j}]
 
-    The interval is a percentile bootstrap that resamples the episodes of both policies in every
-    stratum independently. Where both play the same starts this is wider than it had to be.
+    The interval is a 95% percentile bootstrap that resamples the episodes of both policies
+    independently in each stratum. If both start from the same states, it is wider than necessary.
 
     Reference: Agarwal et al. 2021, https://arxiv.org/abs/2108.13264, section 4.3.
 
     Args:
-        x: Returns of the one policy, shape ``(N,)``.
-        y: Returns of the other, shape ``(M,)``.
+        x: Returns of the first policy, shape ``(N,)``.
+        y: Returns of the second policy, shape ``(M,)``.
         x_strata: Label of each value's stratum, the training seed, shape ``(N,)``.
-        y_strata: The same for ``y``; the same labels occur, shape ``(M,)``.
-        confidence: Coverage asked for, in (0, 1).
-        resamples: Number of bootstrap resamples.
-        seed: Seed of the resampling; the order of the values does not matter.
+        y_strata: The same for ``y``, with the same set of labels, shape ``(M,)``.
 
     Raises:
-        BMRLError: if the values are not finite vectors, the strata differ, or an option does not
-            fit.
+        BMRLError: if the values are not finite vectors, or the strata differ.
 
     Example:
         >>> probability_of_improvement([3.0, 4.0], [1.0, 2.0])
@@ -208,7 +193,7 @@ def probability_of_improvement(
         [np.sort(values[rows]) for rows in _split(len(values), labels)]
         for values, labels in ((ours, x_strata), (theirs, y_strata))
     ]
-    # How often each episode is drawn is all that a resample's probability depends on.
+    # A resample's probability depends only on how often each episode is drawn.
     wins = [
         np.greater.outer(mine, others) + 0.5 * np.equal.outer(mine, others)
         for mine, others in zip(*groups, strict=True)
@@ -223,7 +208,7 @@ def probability_of_improvement(
         return sum(shares) / len(shares)
 
     sizes = [size for win in wins for size in win.shape]
-    return _estimate(sizes, probability, confidence=confidence, resamples=resamples, seed=seed)
+    return _estimate(sizes, probability)
 
 
 def rank_correlation(
@@ -231,33 +216,28 @@ def rank_correlation(
     y: ArrayLike,
     *,
     groups: ArrayLike | None = None,
-    confidence: float = 0.95,
-    resamples: int = 2000,
-    seed: int = 0,
 ) -> Estimate:
-    r"""Whether one measure orders policies as another does: Spearman's rank correlation.
+    r"""Spearman's rank correlation of two measures of the same policies.
 
     .. math::
         \rho = \frac{1}{G} \sum_g \mathrm{corr}\big(\mathrm{rank}(x_g), \mathrm{rank}(y_g)\big)
 
-    with one group, or with the task as the group: ranks are those within a task, and a mean over
-    tasks. Equal values share their mean rank; a group whose ``x`` or ``y`` are all equal is in no
-    order and counts as 0. The interval is a percentile bootstrap over the pairs of each group.
+    There is one group, or one group per task; then ranks are taken within a task and the result
+    is the mean over tasks. Equal values share their mean rank. A group in which all of ``x`` or
+    all of ``y`` are equal counts as 0. The interval is a 95% percentile bootstrap over the pairs
+    of each group.
 
     Reference: Spearman, *The Proof and Measurement of Association between Two Things*, American
     Journal of Psychology 1904.
 
     Args:
-        x: One measure of each policy, such as an estimate of its return, shape ``(N,)``.
-        y: The other, such as its return, in the same order, shape ``(N,)``.
+        x: First measure of each policy, such as an estimate of its return, shape ``(N,)``.
+        y: Second measure, such as its return, in the same order, shape ``(N,)``.
         groups: Label of each policy's group, shape ``(N,)``; ``None`` is one group.
-        confidence: Coverage asked for, in (0, 1).
-        resamples: Number of bootstrap resamples.
-        seed: Seed of the resampling.
 
     Raises:
-        BMRLError: if the values are not two finite vectors of the same length, or an option does
-            not fit.
+        BMRLError: if the values are not two finite vectors of the same length, or the labels have
+            another shape.
 
     Example:
         >>> print(rank_correlation([0.1, 0.2, 0.3], [10.0, 20.0, 20.0]))
@@ -281,74 +261,57 @@ def rank_correlation(
         return total / len(parts)
 
     sizes = [len(rows) for rows in parts]
-    return _estimate(sizes, correlation, confidence=confidence, resamples=resamples, seed=seed)
+    return _estimate(sizes, correlation)
 
 
-def _estimate(
-    sizes: Sequence[int],
-    statistic: Callable[..., Any],
-    *,
-    confidence: float,
-    resamples: int,
-    seed: int,
-) -> Estimate:
-    """A statistic of index vectors of the given sizes, and its interval over resampled ones."""
+def _estimate(sizes: Sequence[int], statistic: Callable[..., Any]) -> Estimate:
+    """Evaluates a statistic of index vectors of the given sizes, with its bootstrap interval."""
     whole = [np.arange(size) for size in sizes]
     value = float(statistic(*whole, axis=-1))
     moving = [index for index in whole if len(index) > 1]
 
     def resampled(*drawn: NDArray[np.int64], axis: int) -> Any:
         rest = iter(drawn)
-        # scipy refuses samples of one value; they are what they are in every resample.
+        # scipy refuses samples of one value, which are the same in every resample.
         return statistic(*(next(rest) if size > 1 else np.zeros(1, int) for size in sizes), axis=-1)
 
-    if not moving:
-        _check_confidence(confidence)
-        return Estimate(value=value, low=value, high=value)
-    low, high = _percentiles(
-        moving, resampled, confidence=confidence, resamples=resamples, seed=seed
-    )
+    low, high = _percentiles(moving, resampled) if moving else (value, value)
     return Estimate(value=value, low=low, high=high)
 
 
 def _percentiles(
-    samples: Sequence[NDArray[Any]],
-    statistic: Callable[..., Any],
-    *,
-    confidence: float,
-    resamples: int,
-    seed: int,
+    samples: Sequence[NDArray[Any]], statistic: Callable[..., Any], *, seed: int = 0
 ) -> tuple[float, float]:
-    """scipy's percentile bootstrap of samples that are resampled independently."""
-    _check_confidence(confidence)
-    # Imported here: scipy.stats takes a second, and processes that only roll out never need it.
+    """Computes scipy's percentile bootstrap of samples that are resampled independently."""
+    # Imported here because it takes a second, and a process that only plays episodes needs none.
     with needs("reports"):
         from scipy.stats import DegenerateDataWarning, bootstrap
 
-    with warnings.catch_warnings():  # of resamples that are left out below
+    with warnings.catch_warnings():  # about resamples that are left out below
         warnings.simplefilter("ignore", DegenerateDataWarning)
         result = bootstrap(
             samples,
             statistic,
             vectorized=True,
             paired=False,
-            confidence_level=confidence,
-            n_resamples=resamples,
+            confidence_level=_CONFIDENCE,
+            n_resamples=RESAMPLES,
             method="percentile",
             rng=np.random.default_rng(seed),
         )
     low, high = result.confidence_interval
     drawn = result.bootstrap_distribution
     if np.isnan(drawn).any():
-        drawn, outside = drawn[~np.isnan(drawn)], (1.0 - confidence) / 2.0
+        drawn = drawn[~np.isnan(drawn)]
         if not drawn.size:
-            raise BMRLError(f"none of {resamples} resamples has a number; valid: more resamples")
+            raise BMRLError(f"none of {RESAMPLES} resamples has a number; valid: more episodes")
+        outside = (1.0 - _CONFIDENCE) / 2.0
         low, high = np.quantile(drawn, [outside, 1.0 - outside])
     return float(low), float(high)
 
 
 def _counts(rows: NDArray[np.int64], size: int) -> NDArray[np.float64]:
-    """How often each of ``size`` rows is drawn, shape ``(*B, n)`` to ``(*B, size)``."""
+    """Counts how often each of ``size`` rows is drawn, shape ``(*B, n)`` to ``(*B, size)``."""
     offsets = size * np.arange(rows.size // rows.shape[-1])
     flat = rows.reshape(-1, rows.shape[-1]) + offsets[:, None]
     counts = np.bincount(flat.ravel(), minlength=size * len(offsets))
@@ -365,13 +328,8 @@ def _vector(name: str, values: ArrayLike) -> NDArray[np.float64]:
     return sample
 
 
-def _check_confidence(confidence: float) -> None:
-    if not 0.0 < confidence < 1.0:
-        raise BMRLError(f"confidence must lie in (0, 1), got {confidence}")
-
-
 def _split(size: int, strata: ArrayLike | None) -> list[NDArray[np.int64]]:
-    """Rows of each stratum, in the order of the labels."""
+    """Returns the rows of each stratum, in the order of the labels."""
     if strata is None:
         return [np.arange(size)]
     labels = np.asarray(strata)

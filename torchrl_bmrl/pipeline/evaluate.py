@@ -64,19 +64,21 @@ def evaluate(run: Run) -> str:
             unit="step",
         )
         write_results(run.folder / "results.csv", [row for part in rows for row in part])
-        table = run.folder / "tables" / "results.md"
+        tables, shown = {}, "results"
     else:
-        evaluate_held_out(run)
-        table = run.folder / "tables" / "held_out.md"
+        tables, shown = {"held_out": evaluate_held_out(run)}, "held_out"
     look = not alone and run.settings.distill.task_encoder == "transition"
     write_report(
         run.folder,
         default_source=settings.latent_sources[0],
         facts=run_facts(run),
+        titles=run.titles,
+        tables=tables,
         seed=run.settings.seed,
         **(look_at_embedding(run) if look else {}),
     )
-    return f"{table.read_text(encoding='utf-8')}\nreport: {run.folder / 'report.html'}"
+    table = (run.folder / "tables" / f"{shown}.md").read_text(encoding="utf-8")
+    return f"{table}\nreport: {run.folder / 'report.html'}"
 
 
 def keep_rows(
@@ -238,7 +240,7 @@ def look_at_embedding(run: Run) -> dict[str, Any]:
         "embeddings": embeddings,
         "training": embed(run, "train")[0],
         "accuracy": accuracy,
-        "explorer": explore_demonstrations(run.data_dir, embeddings),
+        "explorer": explore_demonstrations(run.data_dir, embeddings, titles=run.titles),
     }
 
 

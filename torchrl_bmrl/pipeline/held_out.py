@@ -11,8 +11,6 @@ from torchrl_bmrl.evaluation.fitted_q import estimate_return
 from torchrl_bmrl.files import finite, read_rows, write_rows
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.pipeline.run import Run
-from torchrl_bmrl.reports.page import Section
-from torchrl_bmrl.reports.studies import write_study
 from torchrl_bmrl.reports.tables import Table
 from torchrl_bmrl.run.workers import Report
 
@@ -36,11 +34,14 @@ _PAGE = (
 )
 
 
-def evaluate_held_out(run: Run) -> None:
-    """Judges both stages on held-out demonstrations and writes ``held_out.csv`` and a table.
+def evaluate_held_out(run: Run) -> Table:
+    """Judges both stages on held-out demonstrations and writes ``held_out.csv``.
 
     Args:
         run: an open run with both stages.
+
+    Returns:
+        the numbers of every task.
     """
     log.warning("some tasks have no environment: held-out losses and estimates instead of returns")
     updates = run.settings.evaluate.fqe_updates
@@ -52,7 +53,7 @@ def evaluate_held_out(run: Run) -> None:
         unit="update",
     )
     write_rows(run.folder / "held_out.csv", rows)
-    table = Table(
+    return Table(
         title="Held-out demonstrations",
         caption=_PAGE,
         header=(
@@ -75,7 +76,6 @@ def evaluate_held_out(run: Run) -> None:
             for row in rows
         ],
     )
-    write_study(run.folder, "held_out", Section(heading=table.title, tables=[table]), {})
 
 
 def held_out_job(job: tuple[Run, str], report: Report) -> dict[str, str | float]:

@@ -2,46 +2,45 @@
 
 from __future__ import annotations
 
+from torchrl_bmrl.reports.drawing import task_colors
 from torchrl_bmrl.reports.embedding import Embeddings, measure_goal_distance, measure_stages
-from torchrl_bmrl.reports.explorer import Explorer
-from torchrl_bmrl.reports.figures import (
-    TASK_COLORS,
+from torchrl_bmrl.reports.embedding_figures import (
+    embedding_paths,
     embedding_scatter,
     embedding_stages,
+    embedding_trajectories,
     embedding_tsne,
-    reach_trajectories,
-    stage1_curves,
-    success_curves,
 )
+from torchrl_bmrl.reports.explorer import Explorer
+from torchrl_bmrl.reports.figures import behaviour_trajectories, stage1_curves, success_curves
 from torchrl_bmrl.reports.page import Picture, Section, write_page
+from torchrl_bmrl.reports.paper import table_1, table_2
 from torchrl_bmrl.reports.report import read_stage1_curves, write_report
-from torchrl_bmrl.reports.results_page import check_results_page, write_results_page
 from torchrl_bmrl.reports.studies import read_studies, write_study
 from torchrl_bmrl.reports.tables import (
     Table,
     goal_distance_table,
     results_table,
     stages_table,
-    table_1,
-    table_2,
     task_name,
+    task_titles,
 )
 
 __all__ = [
-    "TASK_COLORS",
     "Embeddings",
     "Explorer",
     "Picture",
     "Section",
     "Table",
-    "check_results_page",
+    "behaviour_trajectories",
+    "embedding_paths",
     "embedding_scatter",
     "embedding_stages",
+    "embedding_trajectories",
     "embedding_tsne",
     "goal_distance_table",
     "measure_goal_distance",
     "measure_stages",
-    "reach_trajectories",
     "read_stage1_curves",
     "read_studies",
     "results_table",
@@ -50,9 +49,10 @@ __all__ = [
     "success_curves",
     "table_1",
     "table_2",
+    "task_colors",
     "task_name",
+    "task_titles",
     "write_page",
     "write_report",
-    "write_results_page",
     "write_study",
 ]

@@ -1,4 +1,4 @@
-// The embedding explorer: points of held-out episodes, one of which is chosen and played.
+// The embedding explorer: points of held-out episodes; one episode is chosen and played.
 // All text from data is set as textContent, never as markup.
 (() => {
   "use strict";
@@ -15,22 +15,32 @@
   const VIRIDIS = ["#440154", "#3b528b", "#21918c", "#5ec962", "#fde725"];
   const FONT = '13px system-ui, "Segoe UI", Roboto, sans-serif';
 
-  // What is chosen. A point is an episode (its place in data.episodes) and a row of it.
+  // The selection. A point is an episode (its index in data.episodes) and one of its rows.
   const state = { task: -1, episode: 0, row: 0, hovered: null, playing: false };
   let view = null; // from embedding to pixels
-  let background = null; // all points, drawn anew only when they change
+  let background = null; // all points, redrawn only when they change
 
   // -- data -----------------------------------------------------------------------------------
 
+  // A distance is null where unknown; a period is null if the duration of a step is unknown.
+  const measured = data.episodes.some((e) => e.distance.some((d) => d !== null));
   const farthest = Math.max(...data.episodes.map((e) => Math.max(...e.distance)), 1e-9);
-  const seconds = (episode, row) => episode.step[row] * data.period;
+  const seconds = (episode, row) => episode.step[row] * (data.tasks[episode.task].period || 0.05);
+  const meters = (distance) => (distance === null ? "–" : `${distance.toFixed(3)} m`);
+  const timeOf = (episode, row) =>
+    data.tasks[episode.task].period
+      ? `${seconds(episode, row).toFixed(2)} s`
+      : `step ${episode.step[row]}`;
   const shown = () => data.episodes.filter((e) => state.task < 0 || e.task === state.task);
   const hasFrames = (episode) => Object.keys(episode.frames).length > 0;
 
   function color(episode, row) {
     const coloring = part("coloring").value;
     if (coloring === "phase") return data.phases[episode.phase[row]].color;
-    if (coloring === "distance") return viridis(episode.distance[row] / farthest);
+    if (coloring === "distance") {
+      const distance = episode.distance[row];
+      return distance === null ? "#b0b4ba" : viridis(distance / farthest);
+    }
     return data.tasks[episode.task].color;
   }
 
@@ -172,7 +182,7 @@
     context.setTransform(view.ratio, 0, 0, view.ratio, 0, 0);
     const chosen = data.episodes[state.episode];
     chosen.x.forEach((_, row) => dot(context, chosen, row, 3, color(chosen, row)));
-    // The whole way faintly, for it may be a tangle; its last half second clearly.
+    // The whole episode faintly, because it may be a tangle; its last ten steps clearly.
     line(chosen, 0, chosen.x.length - 1, "rgba(29, 33, 41, 0.3)", 0.8);
     line(chosen, Math.max(0, state.row - 10), state.row, "#1d2129", 2);
     dot(context, chosen, state.row, 7, color(chosen, state.row), "#000");
@@ -208,14 +218,15 @@
     const [index, row] = state.hovered || [state.episode, state.row];
     const episode = data.episodes[index];
     const task = data.tasks[episode.task].name;
-    const time = `${seconds(episode, row).toFixed(2)} s`;
+    const time = timeOf(episode, row);
     const say = (name, text) => { part(`show-${name}`).textContent = text; };
     say("task", task);
     say("episode", `${episode.number} of ${episode.of}`);
-    say("time", `${time} (step ${episode.step[row]})`);
+    const period = data.tasks[episode.task].period;
+    say("time", period ? `${time} (step ${episode.step[row]})` : time);
     say("phase", data.phases[episode.phase[row]].name);
-    say("distance", `${episode.distance[row].toFixed(3)} m`);
-    say("success", episode.success[row] ? "yes" : "no");
+    say("distance", meters(episode.distance[row]));
+    say("success", episode.success[row] === null ? "–" : episode.success[row] ? "yes" : "no");
     const signed = (value) => value.toPrecision(3).replace("-", "−");
     say("point", `(${signed(episode.x[row])}, ${signed(episode.y[row])})`);
     part("which").textContent = state.hovered ? "Under the pointer" : "Chosen point";
@@ -227,15 +238,17 @@
     if (frame) {
       const source = `data:image/webp;base64,${frame[1]}`;
       if (picture.src !== source) picture.src = source;
-      picture.alt = `${task}, episode ${episode.number}, at ${(frame[0] * data.period).toFixed(2)} s`;
+      const at = timeOf({ task: episode.task, step: [frame[0]] }, 0);
+      picture.alt = `${task}, episode ${episode.number}, at ${at}`;
     } else {
       part("noframe").textContent = data.note || "No pictures were made of this episode.";
     }
 
     const chosen = data.episodes[state.episode];
-    const clock = `${seconds(chosen, state.row).toFixed(2)} s`;
+    const clock = timeOf(chosen, state.row);
+    const distance = chosen.distance[state.row];
     slider.value = state.row;
-    slider.setAttribute("aria-valuetext", `${clock}, ${chosen.distance[state.row].toFixed(3)} m`);
+    slider.setAttribute("aria-valuetext", distance === null ? clock : `${clock}, ${meters(distance)}`);
     part("clock").textContent = clock;
     part("play").textContent = state.playing ? "Pause" : "Play";
   }
@@ -365,6 +378,7 @@
   data.tasks.forEach((task, i) => {
     if (data.episodes.some((e) => e.task === i)) part("task").append(option(task.name, i));
   });
+  if (!measured) part("coloring").querySelector('[value="distance"]').remove();
   canvas.setAttribute("aria-label", data.description);
   chooseTask(-1);
   new ResizeObserver(redraw).observe(canvas);

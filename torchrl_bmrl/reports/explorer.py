@@ -1,4 +1,4 @@
-"""The embedding explorer: the part of the page where a point leads to its moment and picture."""
+"""The embedding explorer: an interactive plot in which each point shows its moment and picture."""
 
 from __future__ import annotations
 
@@ -13,12 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.names import TASKS
-from torchrl_bmrl.reports.figures import TASK_COLORS, _plane
-from torchrl_bmrl.reports.tables import MISSING, task_name
-
-# Unlike tasks, phases have no order of their own; grey joins for the seventh.
-_PHASE_COLORS = (*TASK_COLORS.values(), "#7F7F7F")
+from torchrl_bmrl.reports.drawing import plane, task_colors
+from torchrl_bmrl.reports.tables import MISSING
 
 Moment = tuple[int, int, int]
 """Class index, episode within the task, step within the episode."""
@@ -26,30 +22,32 @@ Moment = tuple[int, int, int]
 
 @dataclass(frozen=True, kw_only=True)
 class Explorer:
-    """Transitions to explore, row by row, and pictures of some of them.
+    """Transitions to explore, one per row, and pictures of some of them.
 
     Args:
-        task_latent: Embeddings m, shape ``(N, d)``, N of at least 1; of d > 2 their first two
+        titles: Titles of the tasks by class index.
+        task_latent: Embeddings m, shape ``(N, d)``, N of at least 1; for d > 2 their first two
             principal components are shown, and the page says so.
         task: Class index, shape ``(N,)``.
         episode: Episode within its task, shape ``(N,)``.
         step: Step within its episode, shape ``(N,)``.
-        distance: End effector to goal, shape ``(N,)``, [m].
-        phase: Name of the expert's phase, N of them; ``""`` where it is not known.
-        success: Whether the task's goal was met after the step, shape ``(N,)``.
+        distance: Distance to the goal, shape ``(N,)``, [m]; NaN where unknown.
+        phase: Names of the expert's phases, shape ``(N,)``; ``""`` where unknown.
+        success: Whether the task's goal was met after the step, shape ``(N,)``; ``None`` where
+            unknown.
         frames: WebP pictures by class index, episode and step.
-        note: Why there are no pictures, where there are none.
-        period: Length of a step [s].
+        note: Why there are no pictures.
+        periods: Duration of a step [s] by class index; if it is missing, times are shown in steps.
 
     Raises:
-        BMRLError: if there is no row, a shape does not fit, an embedding or a distance is not
-            finite, a class index is none of the tasks', a moment occurs twice, or a picture belongs
-            to none.
+        BMRLError: if there is no row, a shape does not fit, an embedding or a distance is infinite,
+            a class index has no title, a moment occurs twice, or a picture belongs to no row.
 
     Example:
         >>> explorer = Explorer(
+        ...     titles=["Lift"],
         ...     task_latent=np.array([[0.5, 1.5]]),
-        ...     task=np.array([1]),
+        ...     task=np.array([0]),
         ...     episode=np.array([0]),
         ...     step=np.array([0]),
         ...     distance=np.array([0.1]),
@@ -60,16 +58,17 @@ class Explorer:
         True
     """
 
+    titles: Sequence[str]
     task_latent: NDArray[Any]
     task: NDArray[np.integer[Any]]
     episode: NDArray[np.integer[Any]]
     step: NDArray[np.integer[Any]]
     distance: NDArray[np.floating[Any]]
     phase: Sequence[str]
-    success: NDArray[np.bool_]
+    success: NDArray[Any]
     frames: Mapping[Moment, bytes] = field(default_factory=dict)
     note: str = ""
-    period: float = 0.05
+    periods: Mapping[int, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.task_latent.ndim != 2 or 0 in self.task_latent.shape:
@@ -78,11 +77,12 @@ class Explorer:
         for name in ("task", "episode", "step", "distance", "phase", "success"):
             if (shape := np.shape(getattr(self, name))) != expected:
                 raise BMRLError(f"{name} must have shape {expected}, got {shape}")
-        for name in ("task_latent", "distance"):
-            if not np.isfinite(getattr(self, name)).all():
-                raise BMRLError(f"{name} must be finite; it holds NaN or infinite values")
-        if not ((self.task >= 0) & (self.task < len(TASKS))).all():
-            raise BMRLError(f"task must lie in [0, {len(TASKS)}), got {np.unique(self.task)}")
+        if not np.isfinite(self.task_latent).all():
+            raise BMRLError("task_latent must be finite; it contains NaN or infinite values")
+        if np.isinf(self.distance).any():
+            raise BMRLError("distance must be finite, or NaN where unknown; it is infinite")
+        if not ((self.task >= 0) & (self.task < len(self.titles))).all():
+            raise BMRLError(f"task must lie in [0, {len(self.titles)}), got {np.unique(self.task)}")
         moments = set(
             zip(self.task.tolist(), self.episode.tolist(), self.step.tolist(), strict=True)
         )
@@ -92,8 +92,8 @@ class Explorer:
             raise BMRLError(f"frames must belong to a row; {lost[0]} does not")
 
     def html(self) -> str:
-        """The explorer as HTML: markup, data and script, everything from data escaped."""
-        # In JSON, "<" only occurs in text: written like this, no text can end the script element.
+        """Returns the explorer as HTML: markup, data and script; all text from data is escaped."""
+        # In JSON "<" occurs only in text. Escaped, no text can end the script element.
         content = json.dumps(self._content(), allow_nan=False).replace("<", "\\u003c")
         return (
             f"{_file('explorer.html')}"
@@ -102,11 +102,11 @@ class Explorer:
         )
 
     def _content(self) -> dict[str, Any]:
-        """What the script reads."""
-        points, note = _plane(self.task_latent)
+        """Returns the data that the script reads."""
+        points, note = plane(self.task_latent)
         axis = "principal component" if "principal" in note else "m"
         phases = sorted(set(self.phase))
-        # In time order, whatever order the transitions came in.
+        # Sorted, so that the order in which the transitions were given has no effect.
         order = np.lexsort((self.step, self.episode, self.task))
         keys = np.stack([self.task, self.episode], axis=1)[order]
         starts = np.flatnonzero(np.append(True, (np.diff(keys, axis=0) != 0).any(axis=1)))
@@ -128,7 +128,7 @@ class Explorer:
                     "y": _short(points[rows, 1]),
                     "distance": _short(self.distance[rows]),
                     "phase": [phases.index(self.phase[row]) for row in rows],
-                    "success": self.success[rows].astype(int).tolist(),
+                    "success": self.success[rows].tolist(),
                     "frames": pictures.get((task, episode), {}),
                 }
             )
@@ -136,23 +136,27 @@ class Explorer:
             "description": "Scatter plot of the task embedding m of held-out transitions"
             + note.replace("\n", ": "),
             "axes": [f"{axis} 1 (no unit)", f"{axis} 2 (no unit)"],
-            "tasks": [{"name": task_name(t), "color": TASK_COLORS[t]} for t in TASKS],
-            "phases": [
-                {"name": name or MISSING, "color": _PHASE_COLORS[i % len(_PHASE_COLORS)]}
-                for i, name in enumerate(phases)
+            "tasks": [
+                {"name": title, "color": color, "period": self.periods.get(i)}
+                for i, (title, color) in enumerate(
+                    zip(self.titles, task_colors(len(self.titles)), strict=True)
+                )
             ],
-            "period": self.period,
+            "phases": [
+                {"name": name or MISSING, "color": color}
+                for name, color in zip(phases, task_colors(len(phases)), strict=True)
+            ],
             "note": self.note,
             "episodes": episodes,
         }
 
     def paragraphs(self) -> list[str]:
-        """How to use it, and what must be known to read it."""
-        _, note = _plane(self.task_latent)
+        """Returns instructions for the reader of the page."""
+        _, note = plane(self.task_latent)
         text = [
             "Each point is the embedding m of one transition of a held-out demonstration. Point at "
-            "one to see its moment, click to choose it. The line is the chosen episode, its last "
-            "half second in black; play it, or move the slider, to follow it beside its film."
+            "it to see its moment; click to choose it. The line is the chosen episode, with its "
+            "last ten steps in black. Play it, or move the slider, to follow it beside its film."
         ]
         if note:
             text.append(f"The embedding is {note.strip().replace(', its', '; drawn are its')}.")
@@ -165,7 +169,7 @@ class Explorer:
 
 
 def style() -> str:
-    """The explorer's style sheet.
+    """Returns the explorer's style sheet.
 
     Example:
         >>> ".explorer" in style()
@@ -178,6 +182,6 @@ def _file(name: str) -> str:
     return files("torchrl_bmrl.reports").joinpath(name).read_text(encoding="utf-8")
 
 
-def _short(values: NDArray[Any]) -> list[float]:
-    # Five digits are more than a screen shows, and half the size.
-    return [float(f"{value:.5g}") for value in values.tolist()]
+def _short(values: NDArray[Any]) -> list[float | None]:
+    # Five digits are more than a screen shows, and take half the space.
+    return [None if np.isnan(value) else float(f"{value:.5g}") for value in values.tolist()]

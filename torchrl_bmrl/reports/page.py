@@ -1,4 +1,4 @@
-"""One HTML page that works from disk: no network; pictures, data and script are inside."""
+"""A self-contained HTML page: pictures, data and script are inside, nothing is loaded."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _TEMPLATE = """\
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light">
-{# The browser itself refuses whatever is not inside. #}
+{# The browser refuses to load anything from elsewhere. #}
 <meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; \
 style-src 'unsafe-inline'; script-src 'unsafe-inline'">
 <title>{{ title }}</title>
@@ -89,8 +89,8 @@ class Picture:
 
     Args:
         png: PNG image.
-        alt: What it shows, for those who cannot see it.
-        caption: What to look for in it.
+        alt: Description for readers who cannot see it.
+        caption: Caption.
 
     Example:
         >>> Picture(png=b"abc", alt="", caption="").base64()
@@ -102,19 +102,19 @@ class Picture:
     caption: str
 
     def base64(self) -> str:
-        """The image as base64 text, for a data URI."""
+        """Returns the image as base64 text, for a data URI."""
         return base64.b64encode(self.png).decode("ascii")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A part of the page: a heading, then text, tables, an explorer and pictures, in this order.
+    """A part of the page: heading, text, tables, explorer and pictures, in this order.
 
     Args:
         heading: Heading.
         paragraphs: Text.
         tables: Tables.
-        explorer: What can be explored.
+        explorer: Explorer of the embedding.
         pictures: Pictures.
 
     Example:
@@ -144,7 +144,7 @@ def write_page(
         path: The file to write or replace.
         title: Title and first heading.
         facts: Names and values for the box at the top, such as seed and versions.
-        sections: The page's parts. All text is escaped.
+        sections: Parts of the page. All text is escaped.
 
     Example:
         >>> import pathlib, tempfile

@@ -1,8 +1,8 @@
-"""The report of a run folder: tables, figures and one page, all from files of results."""
+"""The report of a run folder: tables, figures and one page, computed from files of results."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,6 @@ import numpy as np
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.evaluation.results import Summary, read_results, summarise
 from torchrl_bmrl.files import finite, read_rows, whole, write_atomic
-from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports import paper
 from torchrl_bmrl.reports.embedding import (
     EMBEDDING,
@@ -20,15 +19,14 @@ from torchrl_bmrl.reports.embedding import (
     name_stages,
     success_point,
 )
-from torchrl_bmrl.reports.explorer import Explorer
-from torchrl_bmrl.reports.figures import (
-    Curve,
+from torchrl_bmrl.reports.embedding_figures import (
     embedding_scatter,
     embedding_stages,
+    embedding_trajectories,
     embedding_tsne,
-    reach_trajectories,
-    stage1_curves,
 )
+from torchrl_bmrl.reports.explorer import Explorer
+from torchrl_bmrl.reports.figures import Curve, stage1_curves
 from torchrl_bmrl.reports.page import Picture, Section, write_page
 from torchrl_bmrl.reports.studies import read_studies
 from torchrl_bmrl.reports.tables import (
@@ -36,19 +34,18 @@ from torchrl_bmrl.reports.tables import (
     goal_distance_table,
     results_table,
     stages_table,
-    table_1,
-    table_2,
-    task_name,
+    task_titles,
 )
 
 _CURVE_COLUMNS = {"epoch": whole, "update": whole, "return": finite}
 
 
-def read_stage1_curves(run_dir: Path) -> dict[str, Curve]:
+def read_stage1_curves(run_dir: Path, tasks: Iterable[str]) -> dict[str, Curve]:
     """Reads ``bcq/<task>/evaluations.csv`` of a run folder, for those tasks that have one.
 
     Args:
-        run_dir: The run folder.
+        run_dir: Run folder.
+        tasks: Names of the tasks.
 
     Returns:
         Evaluations by task: epoch, update and returns, in the order of the epochs.
@@ -57,10 +54,10 @@ def read_stage1_curves(run_dir: Path) -> dict[str, Curve]:
         DataError: if a file lacks a column, or a value is not a finite number.
 
     Example:
-        >>> read_stage1_curves(Path("no-such-run"))
+        >>> read_stage1_curves(Path("no-such-run"), ["lift"])
         {}
     """
-    files = {task: run_dir / "bcq" / task / "evaluations.csv" for task in TASKS}
+    files = {task: run_dir / "bcq" / task / "evaluations.csv" for task in tasks}
     curves = {task: _read_curve(path) for task, path in files.items() if path.is_file()}
     return {task: curve for task, curve in curves.items() if curve}
 
@@ -68,37 +65,44 @@ def read_stage1_curves(run_dir: Path) -> dict[str, Curve]:
 def write_report(
     run_dir: Path,
     *,
-    default_source: str,
     facts: Mapping[str, str],
+    titles: Mapping[str, str] | None = None,
+    default_source: str = "prototype",
+    tables: Mapping[str, Table] | None = None,
     embeddings: Embeddings | None = None,
     training: Embeddings | None = None,
     accuracy: float | None = None,
     explorer: Explorer | None = None,
     seed: int = 0,
 ) -> Path:
-    """Writes tables, figures and ``report.html`` of a run folder from its ``results.csv``.
+    """Writes tables, figures and ``report.html`` of a run folder.
 
-    Written are ``tables/{results,table1,table2}.{md,csv}``, with ``training`` also
-    ``tables/{stages,goal_distance}.{md,csv}``, ``figures/*.png`` and ``report.html``, each
-    atomically and after everything has been computed. A figure without data is left out, and the
-    page says so. Studies that the folder holds are shown.
+    It writes ``tables/*.{md,csv}``, ``figures/*.png`` and ``report.html``, each atomically and
+    after everything has been computed. Tables of returns need a ``results.csv``, tables of the
+    embedding need ``training``. The page names each figure that lacks its data, and shows the
+    studies in the folder.
 
     Args:
-        run_dir: The run folder, with ``results.csv`` and, for the training curves,
-            ``bcq/<task>/evaluations.csv`` (columns epoch, update, episode, return, success).
-        default_source: Source of m that comes first in the tables.
+        run_dir: Run folder, with ``results.csv`` if episodes were evaluated, and
+            ``bcq/<task>/evaluations.csv`` (columns epoch, update, episode, return, success) for the
+            training curves.
         facts: Names and values for the box at the top of the page.
-        embeddings: Transitions to draw and to measure, from held-out data.
-        training: Transitions of the training data, which stages and success points come from.
-        accuracy: Held-out classification accuracy of the embedding, in [0, 1].
-        explorer: Transitions to explore, from held-out data.
-        seed: Seed of t-SNE.
+        titles: Titles by task, in the order of the run's tasks; other tasks follow, with titles
+            made from their names.
+        default_source: Source of m that comes first in the tables.
+        tables: Further tables by file name, shown in the summary.
+        embeddings: Held-out transitions, which are drawn and measured.
+        training: Training transitions, to which stages and success points are fitted.
+        accuracy: Held-out accuracy of the task classifier, in [0, 1].
+        explorer: Held-out transitions to explore.
+        seed: Seed of t-SNE, of the stages and of the bootstrap.
 
     Returns:
         Path of the page.
 
     Raises:
-        DataError: if ``results.csv``, a file of training curves or a study is missing or not valid.
+        DataError: if there is nothing to report, or a file of results, training curves or a study
+            is not valid.
 
     Example:
         >>> import tempfile
@@ -108,78 +112,97 @@ def write_report(
         ...     task="lift", policy="bcq", seed=0, episode=0, episode_return=80.0, success=True
         ... )
         >>> write_results(folder / "results.csv", [row])
-        >>> write_report(folder, default_source="prototype", facts={"seed": "0"}).name
+        >>> write_report(folder, facts={"seed": "0"}).name
         'report.html'
     """
     run_dir = Path(run_dir)
-    summaries = summarise(read_results(run_dir / "results.csv"))
-    if not summaries:
-        raise DataError(run_dir / "results.csv", None, "holds no episode to report on")
-    curves = read_stage1_curves(run_dir)
-    tables = {
-        "results": results_table(summaries),
-        "table1": table_1(summaries, epochs={task: curve[-1][0] for task, curve in curves.items()}),
-        "table2": table_2(summaries, default_source=default_source),
-    }
-    stage1, note1 = _draw_stage1(curves, summaries)
-    stage2, note2 = _draw_embeddings(embeddings, training, seed=seed)
-    known, drawn, note3 = _measure_embeddings(embeddings, training, seed=seed)
+    results = run_dir / "results.csv"
+    rows = read_results(results) if results.is_file() else []
+    titles = task_titles(
+        [*(row.task for row in rows), *(embeddings.tasks if embeddings else ())], titles
+    )
+    summaries = summarise(rows, titles)
+    curves = read_stage1_curves(run_dir, titles)
+    studies = read_studies(run_dir)
+    if not (rows or curves or studies or tables or embeddings):
+        raise DataError(results, None, "contains no episode, and there is nothing else to report")
+    returns = {}
+    if rows:
+        epochs = {task: curve[-1][0] for task, curve in curves.items()}
+        returns = {
+            "results": results_table(summaries, titles=titles),
+            "table1": paper.table_1(summaries, titles=titles, epochs=epochs),
+            "table2": paper.table_2(summaries, titles=titles, default_source=default_source),
+        }
+    stage1, note1 = _draw_stage1(curves, summaries, titles)
+    stage2, note2 = _draw_embeddings(embeddings, training, titles, seed=seed)
+    measures, drawn, note3 = _measure_embeddings(embeddings, training, titles, seed=seed)
 
-    for name, table in {**tables, **known}.items():
+    for name, table in {**returns, **(tables or {}), **measures}.items():
         write_atomic(run_dir / "tables" / f"{name}.md", table.markdown())
         write_atomic(run_dir / "tables" / f"{name}.csv", table.csv())
     for name, picture in {**stage1, **stage2, **drawn}.items():
         write_atomic(run_dir / "figures" / f"{name}.png", picture.png)
-    page = run_dir / "report.html"
-    write_page(
-        page,
-        title="Compositional skill learning with batch meta RL",
-        facts=facts,
-        sections=[
-            Section(
-                heading="Summary",
-                paragraphs=headline(summaries, default_source=default_source, accuracy=accuracy),
+    sections = [
+        Section(
+            heading="Summary",
+            paragraphs=headline(
+                summaries, titles=titles, default_source=default_source, accuracy=accuracy
             ),
+            tables=list((tables or {}).values()),
+        )
+    ]
+    if returns or curves:
+        sections.append(
             Section(
                 heading="Stage 1: one BCQ policy per task",
                 paragraphs=note1,
-                tables=[tables["table1"]],
+                tables=[returns["table1"]] if returns else [],
                 pictures=list(stage1.values()),
-            ),
-            Section(
-                heading="Stage 2: one distilled policy for all tasks", tables=[tables["table2"]]
-            ),
-            Section(heading="The task embedding", paragraphs=note2, pictures=list(stage2.values())),
-            *_explore(explorer),
-            Section(
-                heading="What the embedding knows",
-                paragraphs=note3,
-                tables=list(known.values()),
-                pictures=list(drawn.values()),
-            ),
-            *read_studies(run_dir),
-            Section(heading="Everything measured", tables=[tables["results"]]),
-        ],
+            )
+        )
+    if returns:
+        heading = "Stage 2: one distilled policy for all tasks"
+        sections.append(Section(heading=heading, tables=[returns["table2"]]))
+    sections.append(
+        Section(heading="The task embedding", paragraphs=note2, pictures=list(stage2.values()))
     )
+    if explorer:
+        heading = "Explore the embedding"
+        sections.append(
+            Section(heading=heading, paragraphs=explorer.paragraphs(), explorer=explorer)
+        )
+    sections += [
+        Section(
+            heading="Stages and distances in the embedding",
+            paragraphs=note3,
+            tables=list(measures.values()),
+            pictures=list(drawn.values()),
+        ),
+        *studies,
+    ]
+    if returns:
+        sections.append(Section(heading="Everything measured", tables=[returns["results"]]))
+    page = run_dir / "report.html"
+    title = "Compositional skill learning with batch meta RL"
+    write_page(page, title=title, facts=facts, sections=sections)
     return page
 
 
-def _explore(explorer: Explorer | None) -> list[Section]:
-    if explorer is None:
-        return []
-    heading = "Explore the embedding"
-    return [Section(heading=heading, paragraphs=explorer.paragraphs(), explorer=explorer)]
-
-
 def headline(
-    summaries: Sequence[Summary], *, default_source: str, accuracy: float | None
+    summaries: Sequence[Summary],
+    *,
+    titles: Mapping[str, str] | None = None,
+    default_source: str,
+    accuracy: float | None,
 ) -> list[str]:
-    """The few sentences that a hurried reader needs.
+    """Summarises the results in a few sentences.
 
     Args:
-        summaries: What :func:`torchrl_bmrl.evaluation.summarise` returns.
+        summaries: Results of :func:`torchrl_bmrl.evaluation.summarise`.
+        titles: Titles by task, as in :func:`~torchrl_bmrl.reports.tables.task_titles`.
         default_source: Source of m of the distilled policy.
-        accuracy: Held-out classification accuracy of the embedding, in [0, 1].
+        accuracy: Held-out accuracy of the task classifier, in [0, 1].
 
     Returns:
         One paragraph, or none.
@@ -188,18 +211,18 @@ def headline(
         >>> headline([], default_source="prototype", accuracy=0.998)[0][:31]
         'A single linear layer tells a h'
     """
+    titles = task_titles((s.task for s in summaries), titles)
     sentences = []
     bcq = {s.task: s for s in summaries if s.policy == "bcq"}
-    if bcq:
-        sentences.append(f"The BCQ policies, one per task, {_successes(list(bcq.values()))}.")
+    if solved := _successes(list(bcq.values()), titles):
+        sentences.append(f"The BCQ policies, one per task, {solved}.")
     distilled = [
         s for s in summaries if s.policy == "distilled" and s.latent_source == default_source
     ]
-    if distilled:
+    if solved := _successes(distilled, titles):
         sentences.append(
             f"The distilled policy, one for all tasks, its task embedding m from the "
-            f"source “{default_source}”, "
-            f"{_successes(distilled)}."
+            f"source “{default_source}”, {solved}."
         )
     shares = [
         (s.mean_return / bcq[s.task].mean_return, s.task)
@@ -208,65 +231,75 @@ def headline(
     ]
     if shares:
         low, high = min(shares), max(shares)
+        subject = "Its return" if solved else "The distilled policy's return"
         sentences.append(
-            f"Its return is between {low[0]:.1%} ({task_name(low[1])}) and {high[0]:.1%} "
-            f"({task_name(high[1])}) of that of the BCQ policies."
+            f"{subject} is between {low[0]:.1%} ({titles[low[1]]}) and {high[0]:.1%} "
+            f"({titles[high[1]]}) of that of the BCQ policies."
         )
     if accuracy is not None:
+        comparison = f" (paper: {paper.ACCURACY:.0%})" if paper.covers(titles) else ""
         sentences.append(
             f"A single linear layer tells a held-out transition's task from its embedding in "
-            f"{accuracy:.1%} of the cases (paper: {paper.ACCURACY:.0%})."
+            f"{accuracy:.1%} of the cases{comparison}."
         )
     return [" ".join(sentences)] if sentences else []
 
 
-def _successes(summaries: Sequence[Summary]) -> str:
-    """How often the policies of some tasks succeeded, and where least."""
-    episodes = sum(s.episodes for s in summaries)
-    successes = round(sum(s.success_rate * s.episodes for s in summaries))
+def _successes(summaries: Sequence[Summary], titles: Mapping[str, str]) -> str:
+    """Says how often policies succeeded, and where least often; empty if nothing is known."""
+    rates = [(s.success_rate, s) for s in summaries if s.success_rate is not None]
+    if not rates:
+        return ""
+    episodes = sum(s.episodes for _, s in rates)
+    successes = round(sum(rate * s.episodes for rate, s in rates))
     if successes == episodes:
         return f"solved all of {episodes} episodes"
-    worst = min(summaries, key=lambda s: s.success_rate)
+    worst, summary = min(rates, key=lambda item: item[0])
     return (
-        f"solved {successes} of {episodes} episodes (least often on {task_name(worst.task)}: "
-        f"{worst.success_rate:.0%})"
+        f"solved {successes} of {episodes} episodes (least often on {titles[summary.task]}: "
+        f"{worst:.0%})"
     )
 
 
 def _draw_stage1(
-    curves: Mapping[str, Curve], summaries: Sequence[Summary]
+    curves: Mapping[str, Curve], summaries: Sequence[Summary], titles: Mapping[str, str]
 ) -> tuple[dict[str, Picture], list[str]]:
-    """The picture of stage 1, and a sentence on what is missing from it."""
-    missing = [task_name(task) for task in TASKS if task not in curves]
-    note = [f"No training curve was found for {', '.join(missing)}."] if missing else []
+    """Draws the training curves, and names the tasks that have none."""
     if not curves:
         return {}, ["The figure of training curves is left out: no evaluations were found."]
+    missing = [title for task, title in titles.items() if task not in curves]
+    note = [f"No training curve was found for {', '.join(missing)}."] if missing else []
     experts = {s.task: s.mean_return for s in summaries if s.policy == "expert"}
     return {
         "stage1_curves": Picture(
-            png=stage1_curves(curves, expert_means=experts),
+            png=stage1_curves(curves, titles=titles, expert_means=experts),
             alt="Return against training epoch, one panel per task",
             caption=(
                 "Return of the BCQ policy, rolled out after each training epoch: mean over the "
                 "episodes, and a band of one standard deviation to either side. Dashed: mean "
-                "return of the scripted expert whose demonstrations it learns from. Compare the "
-                "paper's figure 3 (push tasks)."
+                "return of the expert whose demonstrations it learns from. Compare the paper's "
+                "figure 3 (push tasks)."
             ),
         )
     }, note
 
 
 def _draw_embeddings(
-    embeddings: Embeddings | None, training: Embeddings | None, *, seed: int
+    embeddings: Embeddings | None,
+    training: Embeddings | None,
+    titles: Mapping[str, str],
+    *,
+    seed: int,
 ) -> tuple[dict[str, Picture], list[str]]:
-    """The pictures of the embedding, and a sentence on what is missing."""
+    """Draws the embedding, and says what is left out."""
     if embeddings is None:
         return {}, ["The figures of the embedding are left out: no embeddings were given."]
     embeddings = embeddings.in_time()
     latent, task = embeddings.task_latent, embeddings.task
+    names = [titles[name] for name in embeddings.tasks]
     pictures = {
         "embedding": Picture(
-            png=embedding_scatter(latent, task),
+            png=embedding_scatter(latent, task, names),
             alt="Scatter plot of task embeddings, one colour per task",
             caption=(
                 "Each point is the embedding m of one transition (state, action, reward, next "
@@ -275,7 +308,7 @@ def _draw_embeddings(
             ),
         ),
         "embedding_tsne": Picture(
-            png=embedding_tsne(latent, task, seed=seed),
+            png=embedding_tsne(latent, task, names, seed=seed),
             alt="t-SNE map of task embeddings, one colour per task",
             caption=(
                 "The same embeddings after t-SNE, which keeps neighbours together and distorts "
@@ -284,65 +317,76 @@ def _draw_embeddings(
             ),
         ),
     }
-    reach = embeddings.on_the_way("reach")
-    if not len(reach.task):
-        return pictures, ["The reach trajectories are left out: no reach transition was given."]
-    center = None if training is None else success_point(training, "reach")
-    pictures["reach_trajectories"] = Picture(
-        png=reach_trajectories(
-            reach.task_latent,
-            reach.episode,
-            reach.distance,
+    for name in embeddings.tasks:
+        way = embeddings.on_the_way(name)
+        if len(way.task) and not np.isnan(way.distance).any():
+            break
+    else:
+        return pictures, ["The trajectories are left out: no distance to a goal is known."]
+    center = None if training is None else success_point(training, name)
+    pictures["embedding_trajectories"] = Picture(
+        png=embedding_trajectories(
+            way.task_latent,
+            way.episode,
+            way.distance,
+            title=titles[name],
             success_point=None if center is None else center[EMBEDDING],
         ),
-        alt="Lines through the embedding, one per reach episode, coloured by distance to the goal",
+        alt="Lines through the embedding, one per episode, coloured by distance to the goal",
         caption=(
-            "Reach episodes as lines through the embedding, from circle to star, up to their first "
-            "success. If the embedding holds the progress of the task, the lines end in one place "
-            "and points of one colour lie on a circle around it. The circles, where drawn, are "
-            "centred on the success point of the training demonstrations; each has the colour of a "
-            "distance to the goal, and the radius that transitions there have in the middle. "
-            "Compare the paper's figure 5."
+            f"{titles[name]}: episodes as lines through the embedding, from circle to star, up to "
+            "their first success. If the embedding contains the progress of the task, the lines "
+            "end in one place and points of one colour lie on a circle around it. The circles are "
+            "centred on the success point of the training demonstrations. Each has the colour of "
+            "a distance to the goal, and the median radius of the transitions at that distance. "
+            "Compare the paper's figure 5 (reach)."
         ),
     )
     return pictures, []
 
 
 def _measure_embeddings(
-    embeddings: Embeddings | None, training: Embeddings | None, *, seed: int
+    embeddings: Embeddings | None,
+    training: Embeddings | None,
+    titles: Mapping[str, str],
+    *,
+    seed: int,
 ) -> tuple[dict[str, Table], dict[str, Picture], list[str]]:
-    """Tables and the picture of what the embedding knows, and sentences on what is missing."""
+    """Measures stages and distances in the embedding, and says what is left out."""
     if embeddings is None or training is None:
         return {}, {}, ["Stages and distances are left out: no training transitions were given."]
-    notes = []
-    tables = {}
-    if stages := measure_stages(training, embeddings, seed=seed):
-        tables["stages"] = stages_table(stages)
+    notes, tables, pictures = [], {}, {}
+    stages = measure_stages(training, embeddings, seed=seed)
+    if stages:
+        tables["stages"] = stages_table(stages, titles=titles)
     else:
         notes.append("The stages are left out: no phases of the expert were recorded.")
     if distances := measure_goal_distance(training, embeddings, seed=seed):
-        tables["goal_distance"] = goal_distance_table(distances)
+        tables["goal_distance"] = goal_distance_table(distances, titles=titles)
     else:
-        notes.append("The distances are left out: no training demonstration succeeds.")
-    way = embeddings.in_stages("lift")
-    if "lift" not in [result.task for result in stages] or len(way.task) < 4:
-        return tables, {}, notes
-    picture = Picture(
-        png=embedding_stages(
-            way.task_latent,
-            way.phase,
-            name_stages(training, embeddings, "lift", seed=seed)[EMBEDDING],
-            embeddings.phase_names["lift"],
-            seed=seed,
-        ),
-        alt="Two t-SNE maps of lift's embeddings: by recorded phase, and by group found",
-        caption=(
-            "t-SNE of the embeddings of lift, held-out episodes that succeed, until half a second "
-            "after their first success: by the phase that the expert recorded, and by the group "
-            "found without it. Compare the paper's figure 4b."
-        ),
-    )
-    return tables, {"embedding_stages": picture}, notes
+        notes.append(
+            "The distances are left out: no training demonstration succeeds, or no distance to a "
+            "goal is known."
+        )
+    for task in (result.task for result in stages if result.transitions >= 4):
+        way = embeddings.in_stages(task)
+        pictures["embedding_stages"] = Picture(
+            png=embedding_stages(
+                way.task_latent,
+                way.phase,
+                name_stages(training, embeddings, task, seed=seed)[EMBEDDING],
+                embeddings.phase_names[task],
+                seed=seed,
+            ),
+            alt="Two t-SNE maps of one task's embeddings: by recorded phase, and by group found",
+            caption=(
+                f"{titles[task]}: t-SNE of the embeddings of held-out episodes that succeed, until "
+                "half a second after their first success. Left: by the phase that the expert "
+                "recorded; right: by the group found without it. Compare the paper's figure 4b."
+            ),
+        )
+        break
+    return tables, pictures, notes
 
 
 def _read_curve(path: Path) -> Curve:

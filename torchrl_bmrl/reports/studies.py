@@ -1,4 +1,4 @@
-"""Studies of a finished run: each keeps its tables and figures, and the page shows them all."""
+"""Studies of a finished run: each saves its table and figures, and the page shows them all."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from torchrl_bmrl.reports.tables import Table
 def write_study(
     run_dir: str | os.PathLike[str], name: str, section: Section, figures: Mapping[str, Picture]
 ) -> None:
-    """Keeps a study's part of the page in a run folder.
+    """Saves a study's part of the page in a run folder.
 
-    Written are ``tables/<name>.{md,csv}``, ``figures/<figure>.png`` and, last,
-    ``studies/<name>.json``, which the report reads; each atomically.
+    It writes ``tables/<name>.{md,csv}``, ``figures/<figure>.png`` and, last,
+    ``studies/<name>.json``, which the report reads. Each file is written atomically.
 
     Args:
-        run_dir: The run folder.
-        name: Of the study; the name of its files.
+        run_dir: Run folder.
+        name: Name of the study and of its files.
         section: Heading, text and one table.
-        figures: Pictures by the name of their file.
+        figures: Pictures by file name.
 
     Example:
         >>> import tempfile
@@ -55,7 +55,7 @@ def write_study(
 
 
 def read_studies(run_dir: str | os.PathLike[str]) -> list[Section]:
-    """The sections of the studies in a run folder, by name.
+    """Reads the sections of all studies in a run folder, sorted by name.
 
     Raises:
         DataError: if a file is not a study's, or one of its figures is missing.
@@ -68,7 +68,7 @@ def _read(path: Path) -> Section:
     try:
         pictures = [
             Picture(
-                # The name alone: a file of a stranger's cannot lead out of the folder.
+                # Only the file name is used, so that a foreign file cannot point out of the folder.
                 png=(path.parents[1] / "figures" / Path(picture["file"]).name).read_bytes(),
                 alt=picture["alt"],
                 caption=picture["caption"],

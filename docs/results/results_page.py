@@ -1,22 +1,14 @@
-"""The page of published results, in Markdown: a function of the three CSV files alone."""
+"""The results page in Markdown, computed from the three CSV files alone."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
-
-from torchrl_bmrl.errors import DataError
-from torchrl_bmrl.evaluation.results import ResultRow, Summary, summarise
-from torchrl_bmrl.evaluation.statistics import Estimate
-from torchrl_bmrl.files import write_atomic
-from torchrl_bmrl.names import TASKS
-from torchrl_bmrl.reports.comparisons import (
+from comparisons import (
     BCQ,
     DEFAULT_SOURCE,
     DISTILLED,
@@ -24,57 +16,47 @@ from torchrl_bmrl.reports.comparisons import (
     Arm,
     ablations_table,
     arms_of,
-    clock_table,
     difference,
     differences_table,
     gains_table,
     policies_table,
     seeds_table,
     spread_table,
-    targets,
     targets_table,
 )
-from torchrl_bmrl.reports.figures import Curve, stage1_curves
-from torchrl_bmrl.reports.page import Picture, Section
-from torchrl_bmrl.reports.published import MAIN, CurveRow, Published, RunRow, read_published
+from published import MAIN, TASKS, CurveRow, Published, RunRow, read_published
+
+from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.evaluation.results import ResultRow, Summary, summarise
+from torchrl_bmrl.evaluation.statistics import Estimate
+from torchrl_bmrl.files import write_atomic
+from torchrl_bmrl.reports import Picture, Section, paper, results_table, stage1_curves, task_titles
+from torchrl_bmrl.reports.figures import Curve
 from torchrl_bmrl.reports.report import headline
-from torchrl_bmrl.reports.tables import policy_name, results_table, table_1, table_2
+from torchrl_bmrl.reports.tables import MISSING, Table, policy_name
 
 CURVES = "images/results_curves.png"
-"""The one picture, below the folder of the page."""
-
-_TEXTS = files("torchrl_bmrl.reports")
-_HEAD = _TEXTS.joinpath("results_head.md").read_text(encoding="utf-8")
-_RETURNS = _TEXTS.joinpath("results_returns.md").read_text(encoding="utf-8")
-_TRIED = _TEXTS.joinpath("results_tried.md").read_text(encoding="utf-8")
+"""The picture, below the folder of the page."""
+_TITLES = task_titles(TASKS)
+_HEAD, _RETURNS, _TRIED = (
+    (Path(__file__).parent / f"{name}.txt").read_text(encoding="utf-8")
+    for name in ("head", "returns", "tried")
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ResultsPage:
-    """A page and its picture.
-
-    Attributes:
-        text: Markdown.
-        curves: PNG image that the text shows as :data:`CURVES`; ``None`` without curves.
-    """
+    """The page's Markdown and its picture, which is ``None`` without training curves."""
 
     text: str
     curves: bytes | None
 
 
 def make_results_page(published: Published) -> ResultsPage:
-    """The page that published results give; a section without data is left out.
-
-    Args:
-        published: what :func:`torchrl_bmrl.reports.published.read_published` returns.
-
-    Example:
-        >>> make_results_page(Published()).text.splitlines()[0]
-        '# Results'
-    """
+    """Makes the page; a section without data is left out."""
     rows = [e.row for e in published.episodes if e.key[:2] == MAIN]
     runs = [run for run in published.runs if run.key[:2] == MAIN]
-    summaries = summarise(rows)
+    summaries = summarise(rows, TASKS)
     sections = [
         *_main_sections(rows, summaries, runs, published.curves),
         *_ablations(published),
@@ -89,19 +71,12 @@ def make_results_page(published: Published) -> ResultsPage:
     return ResultsPage(text=text.rstrip("\n") + "\n", curves=pictures[0] if pictures else None)
 
 
-def write_results_page(folder: str | os.PathLike[str]) -> Path:
-    """Writes ``results.md`` and its pictures from the CSV files in ``results/``.
-
-    Args:
-        folder: the folder of the page.
-
-    Returns:
-        Path of the page.
+def write_results_page(folder: Path) -> Path:
+    """Writes ``results.md`` and its picture into ``folder`` from the CSV files in its ``results``.
 
     Raises:
         DataError: if a CSV file is not valid.
     """
-    folder = Path(folder)
     page = make_results_page(read_published(folder / "results"))
     if page.curves is not None:
         write_atomic(folder / CURVES, page.curves)
@@ -109,23 +84,18 @@ def write_results_page(folder: str | os.PathLike[str]) -> Path:
     return folder / "results.md"
 
 
-def check_results_page(folder: str | os.PathLike[str]) -> None:
-    """Checks that ``results.md`` is what the CSV files give, and that its picture is there.
+def check_results_page(folder: Path) -> None:
+    """Checks that ``results.md`` is what the CSV files give, and that its picture exists.
 
-    The picture is not compared: its bytes depend on the libraries that draw it. The table beside it
-    is computed from the same rows.
-
-    Args:
-        folder: the folder of the page.
+    The picture is not compared, because its bytes depend on the libraries that draw it.
 
     Raises:
         DataError: naming the first line that differs, or the picture if it is missing.
     """
-    folder = Path(folder)
     path = folder / "results.md"
     page = make_results_page(read_published(folder / "results"))
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
-    again = "write it with python recipes/publish.py"
+    again = "write it with python docs/results/publish.py"
     if text != page.text:
         pairs = enumerate(zip_longest(text.split("\n"), page.text.split("\n")), start=1)
         line, (here, there) = next((line, pair) for line, pair in pairs if pair[0] != pair[1])
@@ -141,13 +111,13 @@ def _main_sections(
     runs: Sequence[RunRow],
     curves: Sequence[CurveRow],
 ) -> list[Section]:
-    """What the runs of the paper's sizes gave."""
+    """Sections on the runs with the paper's sizes."""
     if not rows:
         return []
     accuracies = [run.accuracy for run in runs if run.accuracy is not None]
     seeds = ", ".join(str(seed) for seed in sorted({row.seed for row in rows}))
     episodes = len(rows)
-    asked = targets(rows, summaries, runs)
+    targets = targets_table(rows, summaries, runs)
     drawn = _curves(curves)
     sections = [
         Section(
@@ -160,18 +130,20 @@ def _main_sections(
                     accuracy=float(np.mean(accuracies)) if accuracies else None,
                 ),
             ],
-            tables=[*([targets_table(asked)] if asked else []), seeds_table(rows, runs)],
+            tables=[*([targets] if targets.rows else []), seeds_table(rows, runs)],
         ),
         Section(
             heading="The paper's tables",
             tables=[
-                table_1(
+                paper.table_1(
                     summaries,
+                    titles=_TITLES,
                     epochs={task: curve[-1][0] for task, curve in drawn.items()},
                     differences=_differences(rows, BCQ, EXPERT),
                 ),
-                table_2(
+                paper.table_2(
                     [s for s in summaries if s.latent_source in ("", DEFAULT_SOURCE)],
+                    titles=_TITLES,
                     default_source=DEFAULT_SOURCE,
                     differences=_differences(rows, DISTILLED, BCQ),
                 ),
@@ -186,12 +158,12 @@ def _main_sections(
 
 
 def _over_the_expert(rows: Sequence[ResultRow]) -> Section:
-    table = differences_table(rows, [BCQ, DISTILLED], EXPERT)
+    table = differences_table(rows, [BCQ, DISTILLED])
     return Section(heading="Over the expert", tables=[table] if table.rows else [])
 
 
 def _sources(rows: Sequence[ResultRow], summaries: Sequence[Summary]) -> Section:
-    """Where the distilled policy takes m from, if it was asked with more than one source."""
+    """Compares the sources of m, if the distilled policy was evaluated with more than one."""
     arms = {
         arm: f"{arm[1]} (default)" if arm == DISTILLED else arm[1]
         for arm in arms_of(rows)
@@ -218,7 +190,7 @@ def _sources(rows: Sequence[ResultRow], summaries: Sequence[Summary]) -> Section
 
 
 def _curves(rows: Sequence[CurveRow]) -> dict[str, Curve]:
-    """Returns by task and epoch, the episodes of all seeds together."""
+    """Collects the returns by task and epoch, the episodes of all seeds together."""
     found: dict[str, dict[tuple[int, int], list[float]]] = {}
     for row in rows:
         epochs = found.setdefault(row.task, {})
@@ -255,7 +227,7 @@ def _baselines(rows: Sequence[ResultRow]) -> list[Arm]:
 
 
 def _stages(rows: Sequence[ResultRow], summaries: Sequence[Summary]) -> Section:
-    """Other algorithms on the same demonstrations, if there are any."""
+    """Compares with other algorithms on the same demonstrations, if there are any."""
     baselines = _baselines(rows)
     if not baselines:
         return Section(heading="")
@@ -293,7 +265,7 @@ def _ablations(published: Published) -> list[Section]:
 
 
 def _runs(runs: Sequence[RunRow], *, baselines: bool) -> list[Section]:
-    """How long it took, how to do it again, and with what."""
+    """Lists the times, commands and versions of all runs."""
     if not runs:
         return []
     more = " The other algorithms: the same settings with `recipes/baselines.py`, afterwards."
@@ -302,7 +274,7 @@ def _runs(runs: Sequence[RunRow], *, baselines: bool) -> list[Section]:
         commit = f"commit {run.commit}, " if run.commit else ""
         versions.setdefault(f"{commit}{run.versions}", []).append("/".join(map(str, run.key)))
     return [
-        Section(heading="How long it took", tables=[clock_table(runs)]),
+        Section(heading="How long it took", tables=[_clock_table(runs)]),
         Section(
             heading="Again",
             paragraphs=[
@@ -311,8 +283,8 @@ def _runs(runs: Sequence[RunRow], *, baselines: bool) -> list[Section]:
                     [
                         "```bash",
                         *(run.command for run in runs),
-                        'python recipes/publish.py "runs=[FOLDER,FOLDER]"',
-                        "python recipes/publish.py check=true    # whether the page is up to date",
+                        "python docs/results/publish.py FOLDER FOLDER",
+                        "python docs/results/publish.py --check  # whether the page is up to date",
                         "```",
                     ]
                 ),
@@ -321,6 +293,47 @@ def _runs(runs: Sequence[RunRow], *, baselines: bool) -> list[Section]:
             ],
         ),
     ]
+
+
+def _clock_table(runs: Sequence[RunRow]) -> Table:
+    """Minutes that each stage of each run took."""
+
+    def minutes(seconds: float | None) -> str:
+        return MISSING if seconds is None else f"{seconds / 60:.1f}"
+
+    return Table(
+        title="Minutes of each stage",
+        caption=(
+            "Wall-clock minutes, summed over interruptions, with what else the machine did at the "
+            "time. A run with a change may take over what it would only make again from the run "
+            "without it. Workers: processes side by side, one thread each."
+        ),
+        header=(
+            "Preset",
+            "Change",
+            "Seed",
+            "Device",
+            "Workers",
+            "Demonstrations",
+            "Stage 1",
+            "Stage 2",
+            "Evaluation",
+        ),
+        rows=[
+            (
+                run.preset,
+                run.ablation,
+                str(run.seed),
+                run.device,
+                str(run.workers),
+                minutes(run.seconds_collect),
+                minutes(run.seconds_stage_1),
+                minutes(run.seconds_stage_2),
+                minutes(run.seconds_evaluate),
+            )
+            for run in runs
+        ],
+    )
 
 
 def _differences(rows: Sequence[ResultRow], x: Arm, y: Arm) -> dict[str, Estimate]:

@@ -1,91 +1,77 @@
-"""Finished runs into the CSV files of docs/results, and the page docs/results.md from these.
+"""Adds finished runs to the CSV files of docs/results and writes docs/results.md from them.
 
-    python recipes/publish.py "runs=[runs/two_stage-paper-seed1,runs/two_stage-paper-seed2]"
-    python recipes/publish.py               # the page alone, again
-    python recipes/publish.py check=true    # 1 if the page is not what the CSV files give
+    python docs/results/publish.py runs/two_stage-paper-seed1 runs/two_stage-paper-seed2
+    python docs/results/publish.py            # writes the page again
+    python docs/results/publish.py --check    # exits with 1 if the page is not what the files give
 
-A run takes the place of an earlier one of its preset, ablation and seed.
+A run replaces an earlier one with the same preset, ablation and seed.
 """
 
 from __future__ import annotations
 
 import os
 
-import needed  # noqa: F401 (first)
-
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
+import argparse
 import json
 import shlex
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import hydra
-import settings as recipe_settings  # noqa: F401 -- registers what recipe.yaml builds on
-from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig, OmegaConf
+import torchrl_bmrl.run.as_command  # noqa: F401 -- errors at import become one line
 
-from torchrl_bmrl.errors import ConfigError, DataError
-from torchrl_bmrl.evaluation import read_results
-from torchrl_bmrl.files import read_json
-from torchrl_bmrl.names import TASKS
-from torchrl_bmrl.reports import check_results_page, write_results_page
-from torchrl_bmrl.reports.published import (
+# isort: split
+from published import (
+    TASKS,
     CurveRow,
     RunRow,
     read_curve_rows,
     read_published,
     write_published,
 )
+from results_page import check_results_page, write_results_page
+
+from torchrl_bmrl.errors import ConfigError, DataError
+from torchrl_bmrl.evaluation import read_results
+from torchrl_bmrl.files import read_json
 from torchrl_bmrl.run.command_line import exit_codes
 from torchrl_bmrl.run.folder import deciding, read_settings, read_versions
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
-RECIPES = Path(__file__).resolve().parent
+DOCS = Path(__file__).resolve().parents[1]
+RECIPES = DOCS.parent / "recipes"
 STAGES = ("collect", "stage 1", "stage 2", "evaluate")
 
 
-@dataclass
-class Settings:
-    """What to publish."""
+def publish(runs: Sequence[Path], docs: Path = DOCS) -> Path:
+    """Adds the runs to the CSV files and writes the page.
 
-    runs: list[str] = field(default_factory=list)  # folders of finished runs
-    check: bool = False  # writes nothing
-    docs: str = str(RECIPES.parent / "docs")  # folder of the page
+    Returns:
+        path of the page.
 
-
-def publish(settings: Settings) -> None:
-    """Adds the runs to the CSV files and writes the page, or checks it."""
-    docs = Path(settings.docs)
-    if settings.check:
-        if settings.runs:
-            raise ConfigError(f"runs is {settings.runs}; valid with check=true: none")
-        check_results_page(docs)
-        return
+    Raises:
+        BMRLError: if a file of a run is missing or not valid; nothing is written then.
+    """
     published = read_published(docs / "results")
-    for run_dir in map(Path, settings.runs):
+    for run_dir in runs:
         run = read_run(run_dir)
         rows = read_results(run_dir / "results.csv")
         if (path := run_dir / "baselines.csv").exists():
             rows += read_results(path)
         for row in rows:
             if row.seed != run.seed:
-                raise DataError(
-                    run_dir / "results.csv", "seed", f"{row.seed}; the run's is {run.seed}"
-                )
+                message = f"{row.seed}; the run's is {run.seed}"
+                raise DataError(run_dir / "results.csv", "seed", message)
         published = published.with_run(run, rows, read_curves(run_dir, run.seed))
     write_published(docs / "results", published)
-    print(write_results_page(docs))
+    return write_results_page(docs)
 
 
 def read_run(run_dir: Path) -> RunRow:
-    """What a run's folder says of it.
-
-    Raises:
-        BMRLError: if a file of it is missing or not valid.
-    """
+    """Reads a run's settings, versions, times and accuracy from its folder."""
     settings, versions = read_settings(run_dir), read_versions(run_dir)
     command = command_of(settings)
     path = run_dir / "seconds.json"
@@ -108,7 +94,7 @@ def read_run(run_dir: Path) -> RunRow:
 
 
 def read_curves(run_dir: Path, seed: int) -> list[CurveRow]:
-    """The rollouts after each epoch of stage 1, of those tasks that the folder has them of."""
+    """Reads the rollouts after each epoch of stage 1, for those tasks that have them."""
     files = {task: run_dir / "bcq" / task / "evaluations.csv" for task in TASKS}
     return [
         row
@@ -119,23 +105,29 @@ def read_curves(run_dir: Path, seed: int) -> list[CurveRow]:
 
 
 def command_of(settings: Mapping[str, Any]) -> str:
-    """The command that gives the settings of a run's ``config.yaml``.
+    """Returns the command that gives the settings of a run's ``config.yaml``.
 
-    What differs from its preset and ablation becomes overrides; settings that the run did not know
-    yet keep their defaults.
+    Settings that differ from the run's preset and ablation become overrides. Settings that did not
+    exist when the run was made keep their defaults.
 
     Raises:
-        ConfigError: if the run names no preset or ablation that there is, or has a setting that
-            there is no more.
+        ConfigError: if the preset, the ablation or a setting of the run no longer exists.
     """
+    sys.path.append(str(RECIPES))
+    import hydra
+    import settings as recipe_settings  # noqa: F401 -- registers the schema of recipe.yaml
+    from hydra.core.global_hydra import GlobalHydra
+    from omegaconf import OmegaConf
+
     choices = []
     for kind in ("preset", "ablation"):
         valid = sorted(path.stem for path in (RECIPES / "config" / kind).glob("*.yaml"))
         if (name := settings.get(kind)) not in valid:
             raise ConfigError(f"{kind} is {name} in the run; valid: {', '.join(valid)}")
         choices.append(f"{kind}={name}")
-    composed = OmegaConf.to_container(hydra.compose("recipe", choices), resolve=False)
-    usual = deciding(composed)
+    if not GlobalHydra.instance().is_initialized():
+        hydra.initialize_config_dir(str(RECIPES / "config"), version_base="1.3")
+    usual = deciding(OmegaConf.to_container(hydra.compose("recipe", choices), resolve=False))
     differing = {key: x for key, x in deciding(settings).items() if usual.get(key, ...) != x}
     for key in sorted(differing.keys() - usual.keys()):
         raise ConfigError(f"{key} is a setting of the run; valid: those of today's recipes")
@@ -145,14 +137,20 @@ def command_of(settings: Mapping[str, Any]) -> str:
     return shlex.join(["python", "recipes/two_stage.py", *words])
 
 
-ConfigStore.instance().store(name="publish_schema", node=Settings)
-
-
-@hydra.main(version_base="1.3", config_path="config", config_name="publish")
-def main(config: DictConfig) -> None:
+def main() -> None:
     """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("runs", nargs="*", type=Path, help="folders of finished runs")
+    parser.add_argument("--check", action="store_true", help="check the page, write nothing")
+    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page")
+    options = parser.parse_args()
+    if options.check and options.runs:
+        parser.error("--check takes no runs")
     with exit_codes():
-        publish(OmegaConf.to_object(config))
+        if options.check:
+            check_results_page(options.docs)
+        else:
+            print(publish(options.runs, options.docs))
 
 
 if __name__ == "__main__":

@@ -1,50 +1,31 @@
-"""Policies and runs beside each other, as tables computed from published episodes."""
+"""Comparisons of policies and runs, as tables computed from published episodes."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
+from published import TASKS, EpisodeRow, RunRow
 
-from torchrl_bmrl.evaluation.results import POLICIES, ResultRow, Summary
+from torchrl_bmrl.evaluation.results import ResultRow, Summary, policy_order
 from torchrl_bmrl.evaluation.statistics import (
     Estimate,
     probability_of_improvement,
     relative_difference,
 )
-from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports import paper
 from torchrl_bmrl.reports.figures import Curve
-from torchrl_bmrl.reports.published import EpisodeRow, RunRow
-from torchrl_bmrl.reports.tables import MISSING, Table, policy_name, task_name
+from torchrl_bmrl.reports.tables import MISSING, Table, percent, policy_name, task_name
 
 DEFAULT_SOURCE = "prototype"
-"""Source of m that the distilled policy acts with unless it is told another."""
+"""Default source of m of the distilled policy."""
 
 Arm = tuple[str, str]
-"""A policy and its source of m, which is empty for all but the distilled one."""
+"""A policy and its source of m, which is empty for all but the distilled policy."""
 
 EXPERT: Arm = ("expert", "")
 BCQ: Arm = ("bcq", "")
 DISTILLED: Arm = ("distilled", DEFAULT_SOURCE)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Target:
-    """The least that is asked of a policy.
-
-    Attributes:
-        what: what is measured, in words.
-        least: what is asked for, in [-1, 1].
-        measured: number, and in brackets its interval or where it was measured; the lowest task's.
-        value: the number that has to reach ``least``.
-    """
-
-    what: str
-    least: float
-    measured: str
-    value: float
 
 
 def difference(
@@ -57,26 +38,9 @@ def difference(
     """Relative difference of mean returns on the same starts; over several tasks, its mean.
 
     Episodes are paired by task, training seed and number, and resampled in pairs within each task
-    and seed.
-
-    Args:
-        ours: episodes that those of ``x`` are taken from.
-        theirs: episodes that those of ``y`` are taken from.
-        x: the one policy.
-        y: the other.
-        tasks: those to compare on.
-
-    Returns:
-        Difference and 95% interval; ``None`` if the two share no episode on one of the tasks, or
-        the mean return of ``y`` is not positive on one: there are no shares of it.
-
-    Example:
-        >>> rows = [
-        ...     ResultRow(task="lift", policy=p, seed=1, episode=0, episode_return=r, success=True)
-        ...     for p, r in (("expert", 100.0), ("bcq", 101.0))
-        ... ]
-        >>> difference(rows, rows, BCQ, EXPERT, ["lift"]).value
-        0.01
+    and seed. ``ours`` and ``theirs`` are the episodes of which those of the policies ``x`` and
+    ``y`` are taken. The result is ``None`` if the policies share no episode on one of the tasks, or
+    if the mean return of ``y`` is not positive on one.
     """
     one, other = _returns(ours, x, tasks), _returns(theirs, y, tasks)
     shared = sorted(one.keys() & other.keys())
@@ -98,17 +62,7 @@ def difference(
 def improvement(
     rows: Iterable[ResultRow], x: Arm, y: Arm, tasks: Sequence[str] = TASKS
 ) -> Estimate | None:
-    """Probability of improvement; over several tasks, its mean over tasks.
-
-    Args:
-        rows: episodes.
-        x: the one policy.
-        y: the other.
-        tasks: those to compare on.
-
-    Returns:
-        Probability and 95% interval; ``None`` if tasks or seeds of the two differ.
-    """
+    """Probability of improvement, mean over tasks; ``None`` if tasks or seeds of the two differ."""
     rows = list(rows)
     values = [_returns(rows, arm, tasks) for arm in (x, y)]
     strata = [[f"{task}/{seed}" for task, seed, _ in value] for value in values]
@@ -122,62 +76,39 @@ def improvement(
     )
 
 
-def targets(
+def targets_table(
     rows: Sequence[ResultRow], summaries: Sequence[Summary], runs: Sequence[RunRow]
-) -> list[Target]:
-    """What is asked of the two stages, each on the task that fares worst.
+) -> Table:
+    """Compares both stages with their targets; numbers not measured on every task are left out."""
+    lines = []
 
-    What was not measured on every task is left out.
+    def add(what: str, least: float, value: float, measured: str) -> None:
+        met = "yes" if value >= least else "no"
+        lines.append((what, f"at least {least:.0%}", measured, met))
 
-    Args:
-        rows: episodes.
-        summaries: their summaries.
-        runs: the runs that they are of.
-    """
-    found = []
+    def add_success(name: str, arm: Arm) -> None:
+        mine = [s for s in summaries if (s.policy, s.latent_source) == arm]
+        rates = [(s.success_rate, s.task, s.success_interval) for s in mine]
+        if len(rates) < len(TASKS):
+            return
+        rate, task, (low, high) = min(rates, key=lambda row: (row[0], TASKS.index(row[1])))
+        where = f"{task_name(task)}: [{low:.1%}, {high:.1%}]"
+        add(f"{name}: success", 0.95, rate, f"{rate:.1%} ({where})")
+
     if gains := _by_task(rows, BCQ, EXPERT):
-        task, estimate = min(gains.items(), key=lambda item: item[1].low)
-        found.append(
-            Target(
-                what="BCQ over the expert: lower end of the interval of the relative difference",
-                least=-0.02,
-                measured=f"{estimate.low:+.1%} ({task_name(task)}: {_signed(estimate)})",
-                value=estimate.low,
-            )
-        )
-    found += _success_target("BCQ", BCQ, summaries)
+        task, gain = min(gains.items(), key=lambda item: item[1].low)
+        what = "BCQ over the expert: lower end of the interval of the relative difference"
+        add(what, -0.02, gain.low, f"{gain.low:+.1%} ({task_name(task)}: {_signed(gain)})")
+    add_success("BCQ", BCQ)
     if gains := _by_task(rows, DISTILLED, BCQ):
-        task, estimate = min(gains.items(), key=lambda item: item[1].value)
-        found.append(
-            Target(
-                what="Distilled: return as a share of BCQ's",
-                least=0.98,
-                measured=f"{1 + estimate.value:.1%} ({task_name(task)}: {_share(estimate)})",
-                value=1 + estimate.value,
-            )
-        )
-    found += _success_target("Distilled", DISTILLED, summaries)
-    accuracies = [(run.accuracy, run.seed) for run in runs if run.accuracy is not None]
-    if accuracies:
+        task, gain = min(gains.items(), key=lambda item: item[1].value)
+        value, where = 1 + gain.value, f"{task_name(task)}: {_share(gain)}"
+        add("Distilled: return as a share of BCQ's", 0.98, value, f"{value:.1%} ({where})")
+    add_success("Distilled", DISTILLED)
+    if accuracies := [(run.accuracy, run.seed) for run in runs if run.accuracy is not None]:
         accuracy, seed = min(accuracies)
-        found.append(
-            Target(
-                what="Accuracy of the task classifier on held-out transitions",
-                least=paper.ACCURACY,
-                measured=f"{accuracy:.1%} (seed {seed})",
-                value=accuracy,
-            )
-        )
-    return found
-
-
-def targets_table(found: Sequence[Target]) -> Table:
-    """What was asked, what was measured, whether it is met.
-
-    Example:
-        >>> targets_table([Target(what="A", least=0.95, measured="96%", value=0.96)]).rows
-        [('A', 'at least 95%', '96%', 'yes')]
-    """
+        what = "Accuracy of the task classifier on held-out transitions"
+        add(what, paper.ACCURACY, accuracy, f"{accuracy:.1%} (seed {seed})")
     return Table(
         title="What was asked for",
         caption=(
@@ -185,20 +116,12 @@ def targets_table(found: Sequence[Target]) -> Table:
             f"beside it is that task's. Distilled: with the default source of m, {DEFAULT_SOURCE}."
         ),
         header=("What", "Asked", "Measured", "Met"),
-        rows=[
-            (t.what, f"at least {t.least:.0%}", t.measured, "yes" if t.value >= t.least else "no")
-            for t in found
-        ],
+        rows=lines,
     )
 
 
 def seeds_table(rows: Sequence[ResultRow], runs: Sequence[RunRow]) -> Table:
-    """The same by training seed: how far one training differs from another.
-
-    Args:
-        rows: episodes.
-        runs: the runs that they are of.
-    """
+    """Results by training seed, which show how much one training differs from another."""
     lines = []
     for run in runs:
         mine = [row for row in rows if row.seed == run.seed]
@@ -230,30 +153,23 @@ def seeds_table(rows: Sequence[ResultRow], runs: Sequence[RunRow]) -> Table:
     )
 
 
-def differences_table(rows: Sequence[ResultRow], arms: Sequence[Arm], reference: Arm) -> Table:
-    """Relative difference and probability of improvement of policies over one, task by task.
-
-    Args:
-        rows: episodes.
-        arms: policies.
-        reference: the one that they are put beside.
-    """
+def differences_table(rows: Sequence[ResultRow], arms: Sequence[Arm]) -> Table:
+    """Relative difference and probability of improvement over the expert, task by task."""
     lines = []
     for arm in arms:
         for tasks in (*([task] for task in TASKS), TASKS):
-            gain = difference(rows, rows, arm, reference, tasks)
-            chance = improvement(rows, arm, reference, tasks)
+            gain = difference(rows, rows, arm, EXPERT, tasks)
+            chance = improvement(rows, arm, EXPERT, tasks)
             if gain is not None:
                 name = task_name(tasks[0]) if len(tasks) == 1 else "Mean over tasks"
                 lines.append((policy_name(arm[0]), name, _signed(gain), _probability(chance)))
-    name = policy_name(reference[0]).lower()
     return Table(
-        title=f"Difference to the {name}, and probability of improvement",
+        title="Difference to the expert, and probability of improvement",
         caption=(
-            f"Relative difference: mean return of the policy less that of the {name}, over that of "
-            f"the {name}. Both act from the same starts, so episodes are resampled in pairs, "
+            "Relative difference: mean return of the policy less that of the expert, over that of "
+            "the expert. Both act from the same starts, so episodes are resampled in pairs, "
             "within each training seed. Probability of improvement P(X > Y): how often an episode "
-            f"of the policy returns more than an episode of the {name} of the same seed, over all "
+            "of the policy returns more than an episode of the expert of the same seed, over all "
             "pairs, a tie counting half; 50% is no difference. Its interval resamples the "
             "episodes of both independently within each seed (Agarwal et al. 2021). Brackets hold "
             "95% intervals."
@@ -272,15 +188,9 @@ def policies_table(
     title: str,
     caption: str,
 ) -> Table:
-    """Policies by tasks: return as a share of one policy's, and success.
+    """Policies by tasks: return as a share of the reference's, and success.
 
-    Args:
-        rows: episodes.
-        summaries: their summaries.
-        arms: name of each line's policy.
-        reference: the policy that the returns are shares of.
-        title: of the table.
-        caption: what a reader must know besides what the cells are.
+    ``arms`` gives the name of each line's policy.
     """
     success = {(s.task, s.policy, s.latent_source): s.success_rate for s in summaries}
     whose = "the expert's" if reference == EXPERT else f"{policy_name(reference[0])}'s"
@@ -310,12 +220,7 @@ def policies_table(
 
 
 def gains_table(rows: Sequence[ResultRow], pairs: Sequence[tuple[Arm, Arm]]) -> Table:
-    """What one policy has over another, for several pairs of policies.
-
-    Args:
-        rows: episodes.
-        pairs: two policies each.
-    """
+    """Relative differences between pairs of policies."""
     lines = []
     for x, y in pairs:
         each = sorted(_by_task(rows, x, y).items(), key=lambda item: item[1].value)
@@ -339,16 +244,7 @@ def gains_table(rows: Sequence[ResultRow], pairs: Sequence[tuple[Arm, Arm]]) -> 
 
 
 def spread_table(curves: Mapping[str, Curve]) -> Table:
-    """How the spread of returns falls while stage 1 trains.
-
-    Args:
-        curves: evaluations by task, the episodes of all seeds together.
-
-    Example:
-        >>> curve = [(e, 10 * e, np.array([100.0 - 10 / e, 100 + 10 / e])) for e in range(1, 11)]
-        >>> spread_table({"lift": curve}).rows[0]
-        ('Lift', '10', '100.0', '100.0', '7.5', '1.1', '14%')
-    """
+    """Spread of the returns early and late in stage 1, over the episodes of all seeds together."""
     lines = []
     for task in (task for task in TASKS if task in curves):
         fifth = max(1, len(curves[task]) // 5)
@@ -386,12 +282,7 @@ def spread_table(curves: Mapping[str, Curve]) -> Table:
 
 
 def ablations_table(episodes: Sequence[EpisodeRow], runs: Sequence[RunRow]) -> Table:
-    """What becomes of each policy when one thing is changed, beside the runs without the change.
-
-    Args:
-        episodes: episodes of all runs.
-        runs: the runs; those of a preset with an ablation are put beside those without one.
-    """
+    """Runs with one change, beside the runs of the same preset and seed without it."""
     rows: dict[tuple[str, str], list[ResultRow]] = {}
     for episode in episodes:
         rows.setdefault((episode.preset, episode.ablation), []).append(episode.row)
@@ -445,63 +336,18 @@ def ablations_table(episodes: Sequence[EpisodeRow], runs: Sequence[RunRow]) -> T
     )
 
 
-def clock_table(runs: Sequence[RunRow]) -> Table:
-    """Minutes that each stage of each run took.
-
-    Args:
-        runs: the runs.
-    """
-
-    def minutes(seconds: float | None) -> str:
-        return MISSING if seconds is None else f"{seconds / 60:.1f}"
-
-    return Table(
-        title="Minutes of each stage",
-        caption=(
-            "Wall-clock minutes, summed over interruptions, with what else the machine did at the "
-            "time. A run with a change may take over what it would only make again from the run "
-            "without it. Workers: processes side by side, one thread each."
-        ),
-        header=(
-            "Preset",
-            "Change",
-            "Seed",
-            "Device",
-            "Workers",
-            "Demonstrations",
-            "Stage 1",
-            "Stage 2",
-            "Evaluation",
-        ),
-        rows=[
-            (
-                run.preset,
-                run.ablation,
-                str(run.seed),
-                run.device,
-                str(run.workers),
-                minutes(run.seconds_collect),
-                minutes(run.seconds_stage_1),
-                minutes(run.seconds_stage_2),
-                minutes(run.seconds_evaluate),
-            )
-            for run in runs
-        ],
-    )
-
-
 def arms_of(rows: Iterable[ResultRow]) -> list[Arm]:
-    """The policies and their sources of m, in the order of the tables, the default source first."""
+    """Returns the policies and sources of m in the tables' order, the default source first."""
     return sorted(
         {(row.policy, row.latent_source) for row in rows},
-        key=lambda arm: (POLICIES.index(arm[0]), arm[1] != DEFAULT_SOURCE, arm[1]),
+        key=lambda arm: (policy_order(arm[0]), arm[1] != DEFAULT_SOURCE, arm[1]),
     )
 
 
 def _returns(
     rows: Iterable[ResultRow], arm: Arm, tasks: Sequence[str]
 ) -> dict[tuple[str, int, int], float]:
-    """Returns of a policy by task, seed and number of the episode."""
+    """Collects the returns of a policy by task, seed and number of the episode."""
     return {
         (row.task, row.seed, row.episode): row.episode_return
         for row in rows
@@ -510,7 +356,7 @@ def _returns(
 
 
 def _by_task(rows: Sequence[ResultRow], x: Arm, y: Arm) -> dict[str, Estimate]:
-    """Difference of two policies on every task; nothing if one of them is missing."""
+    """Differences of two policies by task; empty if one task is missing."""
     found = {task: difference(rows, rows, x, y, [task]) for task in TASKS}
     known = {task: gain for task, gain in found.items() if gain is not None}
     return known if len(known) == len(TASKS) else {}
@@ -518,22 +364,7 @@ def _by_task(rows: Sequence[ResultRow], x: Arm, y: Arm) -> dict[str, Estimate]:
 
 def _success_rate(rows: Sequence[ResultRow], arm: Arm, tasks: Sequence[str]) -> str:
     hits = [r.success for r in rows if (r.policy, r.latent_source) == arm and r.task in tasks]
-    return f"{np.mean(hits):.0%}" if hits else MISSING
-
-
-def _success_target(name: str, arm: Arm, summaries: Sequence[Summary]) -> list[Target]:
-    rates = [
-        (s.success_rate, TASKS.index(s.task), s.success_interval)
-        for s in summaries
-        if (s.policy, s.latent_source) == arm
-    ]
-    if len(rates) < len(TASKS):
-        return []
-    rate, index, (low, high) = min(rates)
-    where = f"{task_name(TASKS[index])}: [{low:.1%}, {high:.1%}]"
-    return [
-        Target(what=f"{name}: success", least=0.95, measured=f"{rate:.1%} ({where})", value=rate)
-    ]
+    return percent(float(np.mean(hits)) if hits else None)
 
 
 def _signed(estimate: Estimate) -> str:
