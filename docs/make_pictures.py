@@ -26,6 +26,7 @@ from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 DOCS = Path(__file__).parent
 POLICY = DOCS.parent / "recipes" / "policies" / "sawyer.safetensors"
+SIX_TASKS = ("reach", "lift", "push_right", "push_left", "push_up", "push_down")
 SIZE = 256  # pixels of a picture of a task
 
 
@@ -50,7 +51,7 @@ def data_flow() -> bytes:
             middle = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2 + 0.25
             axes.text(*middle, text, ha="center", fontsize=7.5, color="#555555")
 
-    grey, blue, green = "#555555", TASK_COLORS["reach"], TASK_COLORS["push_right"]
+    grey, blue, green = "#555555", *task_colors(3)[::2]
     for row, name in enumerate(("reach", "lift", "four pushes")):
         y = 5.4 - 2.4 * row
         box(0.1, y, 3.4, f"demonstrations\n{name}", grey)
@@ -79,13 +80,13 @@ def data_flow() -> bytes:
 def tasks() -> bytes:
     """An expert's episode of each task, half a second after it succeeded."""
     scenes = []
-    for task in tasks:
+    for task in SIX_TASKS:
         episode = get_task(task).record(3, noise=0.2, **get_task(task).options)
         step = min(int(episode.extras["successes"].argmax()) + 10, len(episode) - 1)
         scenes.append((episode.attributes["model_file"], episode.extras["states"][step : step + 1]))
     pictures = [frames[0] for frames in render_states(scenes, size=SIZE)]
     figure = Figure(figsize=(9, 6.4), layout="constrained")
-    for axes, task, picture in zip(figure.subplots(2, 3).flat, tasks, pictures, strict=True):
+    for axes, task, picture in zip(figure.subplots(2, 3).flat, SIX_TASKS, pictures, strict=True):
         axes.imshow(picture)
         axes.set_title(task_name(task), fontsize=10)
         axes.set_axis_off()

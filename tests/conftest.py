@@ -30,39 +30,33 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="module")
 def recipes() -> Iterator[Any]:
-    """The recipes' modules, importable as they are for a script beside them."""
+    """The module that runs a recipe; recipes are importable as for a script beside them."""
     with pytest.MonkeyPatch.context() as patch:
         from small_runs import RECIPES
 
         patch.syspath_prepend(str(RECIPES))
-        import settings
+        import command
 
-        yield settings
+        yield command
 
 
 @pytest.fixture(scope="module")
-def run(recipes: Any) -> Iterator[Any]:
-    """Runs a recipe's function in this process, with episodes of ten steps."""
+def run(recipes: Any) -> Any:
+    """Runs a function of the pipeline or a study as its recipe does, in this process."""
     pytest.importorskip("robosuite", exc_type=ImportError)
-    from small_runs import HORIZON, SMALL, configured
+    from small_runs import SMALL, configured
 
-    from torchrl_bmrl import names
-    from torchrl_bmrl.evaluation import rollout
-
-    def run(folder: Path, function: Any, *overrides: str) -> Path:
-        settings = configured(*SMALL, f"run_dir={folder}", "workers=1", *overrides)
-        recipes.run_recipe(settings, function)
+    def run(folder: Path, function: Any, *overrides: str, section: str | None = None) -> Path:
+        config = configured(*SMALL, f"run_dir={folder}", "workers=1", *overrides)
+        recipes.run_recipe(config, function, section=section)
         return folder
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(names, "HORIZON", HORIZON)
-        patch.setitem(rollout.evaluate_policy.__kwdefaults__, "max_steps", HORIZON)
-        yield run
+    return run
 
 
 @pytest.fixture(scope="module")
 def finished(run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of all stages that was never stopped."""
-    import two_stage
+    from torchrl_bmrl.pipeline import two_stage
 
-    return run(tmp_path_factory.mktemp("finished"), two_stage.two_stage)
+    return run(tmp_path_factory.mktemp("finished"), two_stage)

@@ -15,11 +15,11 @@ from omegaconf import DictConfig
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 HORIZON = 10
+TASKS = {name: {"task": name, "horizon": HORIZON} for name in ("reach", "lift")}
 SMALL = [
     "preset=smoke",
-    "tasks=[reach,lift]",
-    "collect.train_episodes.reach=1",
-    "collect.train_episodes.lift=1",
+    f"tasks={{reach:{{task:reach,horizon:{HORIZON}}},lift:{{task:lift,horizon:{HORIZON}}}}}",
+    "collect.train_episodes={default:1}",
     "bcq.epochs=2",
     "bcq.updates_per_epoch=6",
     "bcq.batch_size=8",
@@ -63,15 +63,6 @@ def command_line(recipe: str, *overrides: str) -> int:
         except SystemExit as end:
             return int(end.code or 0)
     return 0
-
-
-def short_episodes(folder: Path) -> str:
-    """``PYTHONPATH`` of other processes, so that their episodes have ten steps, too."""
-    folder.mkdir()
-    (folder / "sitecustomize.py").write_text(
-        f"import torchrl_bmrl.names\ntorchrl_bmrl.names.HORIZON = {HORIZON}\n"
-    )
-    return os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")]))
 
 
 def contents(folder: Path, *patterns: str) -> dict[str, bytes]:

@@ -33,9 +33,9 @@ from torchrl.envs.transforms import ObservationNorm
 from torchrl.modules import MLP
 
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.export import export_policy
 from torchrl_bmrl.functional import sample_action_latent
 from torchrl_bmrl.modules import BCQPolicy, DiscreteBCQPolicy, PLASPolicy, make_qvalue_network
-from torchrl_bmrl.export import export_policy
 
 SIZES = {"observation": OBSERVATION_DIM, "task_latent": TASK_LATENT_DIM}
 CANDIDATES = 7

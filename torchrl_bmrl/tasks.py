@@ -177,13 +177,26 @@ def get_task(name: str) -> Task:
     for part in parts:
         if part not in known:
             raise UnknownNameError("task", part, known)
-    tasks = [_registry[part] for part in parts]
+    return compose_tasks([_registry[part] for part in parts])
+
+
+def compose_tasks(tasks: Sequence[Task]) -> Task:
+    """The task of several tasks that are done one after the other in one episode.
+
+    Args:
+        tasks: in their order; a single task is returned as it is.
+
+    Raises:
+        ConfigError: if the tasks cannot follow each other.
+
+    Example:
+        >>> compose_tasks([get_task("reach"), get_task("lift")]).name
+        'reach-lift'
+    """
     if len(tasks) == 1:
         return tasks[0]
-    composers = {task.compose for task in tasks}
     compose = tasks[0].compose
-    if len(composers) > 1 or compose is None:
-        raise ConfigError(
-            f"task {name}: {', '.join(parts)} cannot follow each other in one episode"
-        )
+    if compose is None or any(task.compose != compose for task in tasks):
+        names = ", ".join(task.name for task in tasks)
+        raise ConfigError(f"the tasks {names} cannot follow each other in one episode")
     return compose(tasks)

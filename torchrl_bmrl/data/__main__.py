@@ -22,7 +22,6 @@ from torchrl_bmrl.data.options import LastStep, ReadOptions, Reward
 from torchrl_bmrl.data.robosuite import Relabelling
 from torchrl_bmrl.data.sources import Source, open_source
 from torchrl_bmrl.data.summary import Summary, summarise
-from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.run.command_line import exit_codes
 from torchrl_bmrl.run.progress import progress
 
@@ -173,7 +172,7 @@ def reading_options() -> argparse.ArgumentParser:
         "--horizon", type=int, help="steps of the longest episode (D4RL's files without timeouts)"
     )
     group.add_argument(
-        "--task", choices=TASKS, help="the task in whose scene a robosuite demo.hdf5 was recorded"
+        "--task", help="the task in whose scene a robosuite demo.hdf5 was recorded, such as lift"
     )
     group.add_argument(
         "--tracking",

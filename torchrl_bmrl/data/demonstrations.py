@@ -34,9 +34,9 @@ TRANSITION_KEYS = (
 """Keys of the transitions that training reads."""
 
 
-def demonstration_path(data_dir: Path, task: Task) -> Path:
-    """The file with a task's demonstrations."""
-    return data_dir / f"{task.name}.hdf5"
+def demonstration_path(data_dir: Path, name: str) -> Path:
+    """The file with the demonstrations of the task of a name."""
+    return data_dir / f"{name}.hdf5"
 
 
 def read_demonstrations(
@@ -149,14 +149,16 @@ def write_statistics(data_dir: Path, tasks: Sequence[Task]) -> ObservationStatis
             observations or actions differ in size or parts.
     """
     raw = [
-        read_demonstrations(demonstration_path(data_dir, task), task, split="train", index=index)
+        read_demonstrations(
+            demonstration_path(data_dir, task.name), task, split="train", index=index
+        )
         for index, task in enumerate(tasks)
     ]
     first = _layout(tasks[0], raw[0])
     for task, data in zip(tasks, raw, strict=True):
         if (layout := _layout(task, data)) != first:
             raise DataError(
-                demonstration_path(data_dir, task),
+                demonstration_path(data_dir, task.name),
                 None,
                 f"its transitions have {layout}; valid: {first}, as those of {tasks[0].name}",
             )
@@ -231,7 +233,7 @@ def load_transitions(
     Raises:
         DataError: for a file that :func:`read_demonstrations` refuses.
     """
-    path = demonstration_path(data_dir, task)
+    path = demonstration_path(data_dir, task.name)
     data = read_demonstrations(path, task, split=split, index=index)
     # The same keys for every task: other arrays may differ from file to file.
     return transform_data(data, task, statistics).select(*TRANSITION_KEYS)

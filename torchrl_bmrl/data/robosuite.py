@@ -26,9 +26,9 @@ import numpy as np
 from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
 from torchrl_bmrl.data.hdf5 import open_file, read_names
 from torchrl_bmrl.data.recordings import Recording, read_recording, resample
+from torchrl_bmrl.envs.skills import make_skills
 from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.extras import needs
-from torchrl_bmrl.names import check_task
 
 if TYPE_CHECKING:
     import mujoco
@@ -117,8 +117,8 @@ def open_episodes(
 
     Args:
         path: the file; it is only read.
-        task: one of :data:`torchrl_bmrl.names.TASKS`; reach needs the goal, which only recordings
-            of that task have (their site ``goal_marker``).
+        task: a skill of :data:`~torchrl_bmrl.envs.skills.SKILLS`; reach needs the goal, which only
+            recordings of that task have (their site ``goal_marker``).
         tracking: share of a commanded delta that the arm covers within one step. The controller
             measures deltas from the pose that it has reached: a command held at 1 moves the arm by
             about 11 mm and not 50 mm a step. With 1 an action is the motion itself; with
@@ -135,7 +135,7 @@ def open_episodes(
         DataError: naming file, key and row: on opening for a missing or damaged file, when an
             episode is read for states or a model that are missing, damaged or of another scene.
     """
-    check_task(task)
+    make_skills(task)  # refuses an unknown name before the file is opened
     if not 0 < tracking <= 1:
         raise ConfigError(f"tracking must be in (0, 1], got {tracking}")
     with ExitStack() as stack:

@@ -48,7 +48,7 @@ def make_task(
 ) -> Task:
     """The task of one skill, to be registered with :func:`~torchrl_bmrl.tasks.register_task`.
 
-    Its options are ``skills``, ``robot``, ``gripper`` and ``stepper``, those of
+    Its options are ``skills``, ``robot``, ``gripper``, ``stepper`` and ``horizon``, those of
     :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`. Compositions have :data:`STAGE_HORIZON` steps
     for each skill.
 
@@ -65,22 +65,21 @@ def make_task(
         >>> task.name, task.horizon, task.options["robot"]
         ('lift', 200, 'Panda')
     """
-    return _make_task(
-        [skill], [expert], {"robot": robot, "gripper": "default", "stepper": "fast"}, horizon
-    )
+    options = {"robot": robot, "gripper": "default", "stepper": "fast", "horizon": horizon}
+    return _make_task([skill], [expert], options)
 
 
 def _make_task(
-    skills: Sequence[Skill], experts: Sequence[type[Expert]], options: dict[str, Any], horizon: int
+    skills: Sequence[Skill], experts: Sequence[type[Expert]], options: dict[str, Any]
 ) -> Task:
     return Task(
         name="-".join(skill.name for skill in skills),
-        make_env=partial(make_tabletop_env, horizon=horizon),
-        record=partial(record_episode, experts=tuple(experts), horizon=horizon),
+        make_env=make_tabletop_env,
+        record=partial(record_episode, experts=tuple(experts)),
         parts=("robot0_joint_pos", *OBSERVATION_PARTS[2:]),
         observation=observation_transforms,
         options={**options, "skills": tuple(skills)},
-        horizon=horizon,
+        horizon=options["horizon"],
         success="success",
         compose=compose_tasks,
     )
@@ -105,7 +104,8 @@ def compose_tasks(tasks: Sequence[Task]) -> Task:
         names = ", ".join(task.name for task in tasks)
         raise ConfigError(f"{names} have the arms {', '.join(sorted(robots))}; valid: one arm")
     skills, experts = _chain(tasks)
-    return _make_task(skills, experts, dict(tasks[0].options), STAGE_HORIZON * len(skills))
+    options = {**tasks[0].options, "horizon": STAGE_HORIZON * len(skills)}
+    return _make_task(skills, experts, options)
 
 
 def _chain(tasks: Sequence[Task]) -> tuple[list[Skill], list[type[Expert]]]:

@@ -51,7 +51,7 @@ def collect(run: Run) -> None:
 
 def _import_files(run: Run) -> None:
     tasks = [task for task in run.tasks if task.files is not None]
-    missing = [task for task in tasks if not demonstration_path(run.data_dir, task).exists()]
+    missing = [task for task in tasks if not demonstration_path(run.data_dir, task.name).exists()]
     if not missing:
         return
     without_env = [task for task in tasks if "env" not in task.options]
@@ -61,7 +61,7 @@ def _import_files(run: Run) -> None:
             assert task.files is not None
             import_demonstrations(
                 task.files.path,
-                demonstration_path(run.data_dir, task),
+                demonstration_path(run.data_dir, task.name),
                 options=_options(task),
                 valid_share=task.files.valid_share,
                 bounds=_bounds_of_env(task) or shared,

@@ -22,15 +22,15 @@ from torchrl_bmrl.data.demonstrations import (
     read_statistics,
 )
 from torchrl_bmrl.envs.transforms import ObservationStatistics, make_env
-from torchrl_bmrl.errors import BMRLError, ConfigError
+from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome, evaluate_policy
 from torchrl_bmrl.objectives import BCQLoss
 from torchrl_bmrl.pipeline.agents import Student, load_bcq_loss, load_student
-from torchrl_bmrl.pipeline.settings import Settings
+from torchrl_bmrl.pipeline.settings import SIX_TASKS, Settings
 from torchrl_bmrl.pipeline.task_files import make_tasks, read_task_file
 from torchrl_bmrl.run.locks import hold_run
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
-from torchrl_bmrl.tasks import Task
+from torchrl_bmrl.tasks import Task, compose_tasks
 
 log = logging.getLogger(__name__)
 
@@ -65,7 +65,7 @@ class Run:
     """
 
     def __init__(self, settings: Settings) -> None:
-        tasks = settings.tasks
+        tasks = list(SIX_TASKS) if settings.tasks is None else settings.tasks
         if isinstance(tasks, str):
             tasks = read_task_file(tasks)
         made = make_tasks(tasks)
@@ -115,8 +115,22 @@ class Run:
         return all(task.make_env is not None for task in self.tasks)
 
     def task(self, name: str) -> Task:
-        """The task of a name."""
+        """The task of a name.
+
+        Raises:
+            UnknownNameError: for a name that is not a task of the run.
+        """
+        if name not in self.names:
+            raise UnknownNameError("task of the run", name, self.names)
         return self.tasks[self.names.index(name)]
+
+    def composition(self, name: str) -> Task:
+        """The task of several of this run's tasks in a row, such as ``"reach-lift"``.
+
+        Raises:
+            ConfigError: for a name that is not a task of the run, or tasks that cannot be composed.
+        """
+        return compose_tasks([self.task(part) for part in name.split("-")])
 
     # -- files ---------------------------------------------------------------------------------
 
@@ -134,7 +148,7 @@ class Run:
 
     def demonstrations(self, name: str) -> Path:
         """The file with a task's demonstrations."""
-        return demonstration_path(self.data_dir, self.task(name))
+        return demonstration_path(self.data_dir, name)
 
     def agent_path(self, name: str) -> Path:
         """Checkpoint of a stage-1 agent; the first agent of a task has the task's name."""

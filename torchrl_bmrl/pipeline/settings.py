@@ -118,7 +118,7 @@ class Settings:
     seed: int = 0
     run_dir: str = "runs/mine"
     base: str | None = None  # another run's folder: its files are reused where settings agree
-    tasks: Any = field(default_factory=lambda: list(SIX_TASKS))  # names, or a YAML file of tasks
+    tasks: Any = None  # names, or a YAML file of tasks; null: the six Sawyer tasks
     robot: str | None = None  # arm of the robosuite tasks; null: the task's own
     only: list[str] | None = None  # tasks of this job of train_bcq.py; other jobs train the rest
     # processes; no result depends on them

@@ -96,8 +96,12 @@ def _make_task(name: str, entry: Mapping[str, Any]) -> Task:
     if "task" in entry:
         task = get_task(str(entry["task"]))
         options = {key: x for key, x in entry.items() if key not in ("task", "title")}
-        title = str(entry.get("title", ""))
-        return replace(task.with_options(**options), name=name, title=title)
+        return replace(
+            task.with_options(**options),
+            name=name,
+            horizon=options.get("horizon", task.horizon),
+            title=str(entry.get("title", "")),
+        )
     if "demonstrations" not in entry:
         raise ConfigError(
             f"task {name} has {', '.join(entry) or 'nothing'}; valid: demonstrations (a file or "
