@@ -19,6 +19,7 @@ from PIL import Image
 from tensordict import TensorDict
 
 from torchrl_bmrl.envs.rendering import render_states
+from torchrl_bmrl.envs.skills import SKILLS
 from torchrl_bmrl.pipeline.agents import load_student
 from torchrl_bmrl.reports import embedding_scatter, task_name
 from torchrl_bmrl.tasks import get_task
@@ -79,13 +80,13 @@ def data_flow() -> bytes:
 def tasks() -> bytes:
     """An expert's episode of each task, half a second after it succeeded."""
     scenes = []
-    for task in tasks:
+    for task in SKILLS:
         episode = get_task(task).record(3, noise=0.2, **get_task(task).options)
         step = min(int(episode.extras["successes"].argmax()) + 10, len(episode) - 1)
         scenes.append((episode.attributes["model_file"], episode.extras["states"][step : step + 1]))
     pictures = [frames[0] for frames in render_states(scenes, size=SIZE)]
     figure = Figure(figsize=(9, 6.4), layout="constrained")
-    for axes, task, picture in zip(figure.subplots(2, 3).flat, tasks, pictures, strict=True):
+    for axes, task, picture in zip(figure.subplots(2, 3).flat, SKILLS, pictures, strict=True):
         axes.imshow(picture)
         axes.set_title(task_name(task), fontsize=10)
         axes.set_axis_off()
