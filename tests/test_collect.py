@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -43,9 +43,9 @@ def short(name: str, **options: object) -> Task:
 
 
 @pytest.fixture(scope="module")
-def collected(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Path]]:
+def collected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A collection by one worker."""
-    yield run(tmp_path_factory.mktemp("collected"))
+    return run(tmp_path_factory.mktemp("collected"))
 
 
 def run(

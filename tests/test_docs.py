@@ -6,6 +6,8 @@ import importlib
 import os
 import re
 import shlex
+import sys
+import types
 from pathlib import Path
 
 import pytest
@@ -30,12 +32,15 @@ NEEDS = {page: re.findall(r"<!-- needs: (\w+) -->", page.read_text()) for page i
         if BLOCKS[page]
     ],
 )
-def test_examples_of_a_page_run_one_after_the_other(page: Path) -> None:
+def test_examples_of_a_page_run_one_after_the_other(
+    page: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for package in NEEDS[page]:
         pytest.importorskip(package)
-    namespace = {"__name__": "example"}
+    module = types.ModuleType("example")  # dataclasses look up their module
+    monkeypatch.setitem(sys.modules, "example", module)
     for block in BLOCKS[page]:
-        exec(compile(block, page.name, "exec"), namespace)
+        exec(compile(block, page.name, "exec"), module.__dict__)
 
 
 def test_readme_shows_a_loss_in_use() -> None:
