@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 import torch
@@ -78,6 +79,26 @@ def action_bounds(
     space = made.base_env.action_spec.space
     made.close()
     return tuple(space.low.tolist()), tuple(space.high.tolist())
+
+
+def max_episode_steps(env: str, env_options: Mapping[str, Any] | None = None) -> int | None:
+    """Steps after which gymnasium truncates an episode; ``None``: it does not.
+
+    Args:
+        env: as in :func:`make_gym_env`.
+        env_options: as in :func:`make_gym_env`.
+
+    Example:
+        >>> max_episode_steps("Pendulum-v1"), max_episode_steps("Pendulum-v1", {"g": 9.8})
+        (200, 200)
+    """
+    with needs("robosuite"):
+        import gymnasium
+
+    module, _, name = env.rpartition(":")
+    if module:
+        import_module(module)  # registers the id
+    return (env_options or {}).get("max_episode_steps") or gymnasium.spec(name).max_episode_steps
 
 
 def _make_one(env: str, env_options: dict[str, Any], success: str | None) -> EnvBase:

@@ -383,7 +383,8 @@ def make_env(
     observation = make_observation_transform(task, statistics, parts=parts, cast=cast)
     if statistics is not None:
         _check_observation(task, env, statistics, observation)
-    return TransformedEnv(env, Compose(observation, RewardSum(), *transforms))
+    made = Compose(observation, RewardSum(), *transforms)
+    return TransformedEnv(env, made, auto_unwrap=True)
 
 
 def _check_observation(

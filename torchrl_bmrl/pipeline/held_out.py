@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import warnings
 
 import torch
 from tensordict import TensorDictBase
@@ -88,7 +89,8 @@ def held_out_job(job: tuple[Run, str], report: Report) -> dict[str, str | float]
     valid, index = run.transitions(name, "valid"), run.names.index(name)
     loss, (student, metadata) = run.teacher(name), run.student()
     torch.manual_seed(run.seed("held out", name))
-    with torch.no_grad():
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "No target network updater")  # nothing is trained here
         generator, qvalue = (f(valid.copy())[0] for f in (loss.generator_loss, loss.qvalue_loss))
     teacher = BCQPolicy.frozen(loss, num_candidates=loss.num_candidates)
     policy = student.policy(num_candidates=loss.num_candidates, latent_clip=metadata["latent_clip"])

@@ -21,6 +21,7 @@ from torchrl_bmrl.data.demonstrations import (
     load_transitions,
     read_statistics,
 )
+from torchrl_bmrl.envs.gym import max_episode_steps
 from torchrl_bmrl.envs.transforms import ObservationStatistics, make_env
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome, evaluate_policy
@@ -273,9 +274,15 @@ class Run:
             return evaluate_policy(env, policy, seeds, max_steps=self.horizon(task), report=report)
 
     def horizon(self, task: Task) -> int:
-        """Steps after which an episode is cut off: the task's, or its longest demonstration."""
-        if task.horizon is not None:
-            return task.horizon
+        """Steps after which an episode is cut off.
+
+        The task's horizon; without one gymnasium's, or the length of the longest demonstration.
+        """
+        horizon = task.horizon
+        if horizon is None and "env" in task.options:
+            horizon = max_episode_steps(task.options["env"], task.options.get("env_options"))
+        if horizon is not None:
+            return horizon
         return int(self.transitions(task.name, "train")["step"].max()) + 1
 
 
