@@ -15,7 +15,12 @@ from helpers import NO_UPDATER
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-BLOCKS = {page: re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL) for page in PAGES}
+FILES = re.compile(r"<!-- file: \S+ -->\n```\w+\n.*?```", re.DOTALL)
+"""Files that a page shows: test_own_tasks.py writes and uses them."""
+BLOCKS = {
+    page: re.findall(r"```python\n(.*?)```", FILES.sub("", page.read_text()), re.DOTALL)
+    for page in PAGES
+}
 NEEDS = {page: re.findall(r"<!-- needs: (\w+) -->", page.read_text()) for page in PAGES}
 
 
