@@ -512,6 +512,7 @@ except BaseException as error:
     print(f"{type(error).__name__}: {error}")
     sys.exit(77)
 import numpy as np
+from torchrl_bmrl.envs.tabletop import TabletopEnv
 env = TabletopEnv("reach", render_mode="rgb_array", image_size=(256, 320))
 env.reset(seed=1)
 shown = env.render()

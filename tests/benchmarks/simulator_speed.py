@@ -29,14 +29,15 @@ import mujoco
 import numpy as np
 import torch
 
-from torchrl_bmrl.envs.tabletop import TabletopEnv
+from torchrl_bmrl.envs.skills import SKILLS
+from torchrl_bmrl.envs.tabletop import STEPPERS, TabletopEnv
 from torchrl_bmrl.envs.transforms import make_env
 from torchrl_bmrl.evaluation.rollout import evaluate_policy
 from torchrl_bmrl.experts.collect import collect_demonstrations
 from torchrl_bmrl.experts.controllers import make_expert
 from torchrl_bmrl.modules import BCQPolicy
-from torchrl_bmrl.names import HORIZON, STEPPERS, TASKS
 from torchrl_bmrl.pipeline.agents import make_bcq_loss
+from torchrl_bmrl.tasks import get_task
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
@@ -82,11 +83,11 @@ def bare(env: TabletopEnv, states: list[np.ndarray]) -> float:
     return total
 
 
-def step_table(rounds: int, steps: int = HORIZON) -> None:
+def step_table(rounds: int, steps: int = 200) -> None:
     """Control steps per second of one process, per task."""
     print("\n| Task | robosuite | fast | bare, robosuite's model | bare, lean | fast / robosuite |"
           " fast / bare (robosuite's, lean) |\n|---|---:|---:|---:|---:|---:|---:|")  # fmt: skip
-    for task in TASKS:
+    for task in SKILLS:
         stock, fast = (TabletopEnv(task, stepper=name) for name in reversed(STEPPERS))
         actions, states = episode(fast, steps)
         play(stock, actions[:3])  # compiled, and in the caches
@@ -108,10 +109,12 @@ def worker_table(episodes: int) -> None:
     for stepper in STEPPERS:
         for workers in (1, 2):
             with tempfile.TemporaryDirectory() as folder:
-                options = {"noise": 0.2, "seed": 0, "workers": workers, "stepper": stepper}
+                options = {"noise": 0.2, "seed": 0, "workers": workers}
+                lift = get_task("lift").with_options(stepper=stepper)
                 time = seconds(
                     lambda: collect_demonstrations(
                         Path(folder),
+                        [lift],  # noqa: B023
                         {"lift": episodes - 1},
                         valid_episodes=1,
                         **options,  # noqa: B023
@@ -155,11 +158,10 @@ import sys
 from pathlib import Path
 def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4 / 1024
-from torchrl_bmrl.experts import collect
-from torchrl_bmrl.experts.controllers import ExpertGains
+from torchrl_bmrl.tasks import get_task
 before = resident()
-for task in ("lift", "push_left"):
-    collect.collect_episode(task, 0, noise=0.2, gains=ExpertGains(), stepper=sys.argv[1])
+for task in map(get_task, ("lift", "push_left")):
+    task.record(0, noise=0.2, **task.with_options(stepper=sys.argv[1]).options)
 print(f"{before:.0f} | {resident():.0f}")
 """
 
