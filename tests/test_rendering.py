@@ -15,7 +15,7 @@ pytest.importorskip("robosuite", exc_type=ImportError)
 import gymnasium
 
 import torchrl_bmrl.envs  # registers the ids  # noqa: F401
-from torchrl_bmrl.envs import rendering, sawyer
+from torchrl_bmrl.envs import rendering, tabletop
 from torchrl_bmrl.envs.registration import gymnasium_id
 from torchrl_bmrl.envs.tabletop import TabletopEnv
 from torchrl_bmrl.envs.vector import TabletopVectorEnv
@@ -89,7 +89,7 @@ def test_an_environment_that_cannot_draw_is_refused_at_once(
     def none_works() -> str:
         raise RenderError(["egl: none", "osmesa: none"])
 
-    monkeypatch.setattr(sawyer, "graphics_library", none_works)
+    monkeypatch.setattr(tabletop, "graphics_library", none_works)
     with pytest.raises(RenderError, match="egl: none; osmesa: none"):
         make("reach", render_mode="rgb_array")
     make("reach").close()
