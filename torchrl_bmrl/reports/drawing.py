@@ -161,8 +161,16 @@ def scatter_by_task(
 
 def dot(label: str, marker: str, color: str, *, edge: str = "none", size: float = 7) -> Line2D:
     """Makes a legend entry: a single marker."""
-    style = {"marker": marker, "color": color, "markeredgecolor": edge, "markersize": size}
-    return Line2D([], [], label=label, linestyle="none", **style)
+    return Line2D(
+        [],
+        [],
+        label=label,
+        linestyle="none",
+        marker=marker,
+        color=color,
+        markeredgecolor=edge,
+        markersize=size,
+    )
 
 
 def legend_below(axes: Axes, handles: list[Any]) -> None:
