@@ -21,7 +21,7 @@ for extra in ("hydra", "h5py", "robosuite", "safetensors", "scipy", "matplotlib"
 import yaml
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
-from published_data import DOCS, make_rows
+from published_data import make_rows
 from small_runs import RECIPES
 
 # isort: split
@@ -40,7 +40,8 @@ def publish() -> Iterator[Any]:
         pytest.MonkeyPatch.context() as patch,
         initialize_config_dir(str(RECIPES / "config"), version_base="1.3"),
     ):
-        patch.syspath_prepend(str(DOCS / "results"))
+        patch.syspath_prepend(str(RECIPES))
+        import command  # noqa: F401 -- registers the schema of recipe.yaml
         import publish
 
         yield publish

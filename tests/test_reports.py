@@ -20,7 +20,6 @@ for extra in ("scipy", "matplotlib", "jinja2", "sklearn"):
 from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.evaluation import ResultRow, summarise, write_results
 from torchrl_bmrl.evaluation.embedding import STAGE_TAIL
-from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports import (
     Embeddings,
     Section,
@@ -51,6 +50,7 @@ from torchrl_bmrl.reports.drawing import _lab
 ARMS = [("expert", ""), ("bcq", ""), ("distilled", "prototype"), ("distilled", "online")]
 
 
+TASKS = tuple(paper.TABLE_1)
 TITLES = task_titles(TASKS)
 NAMES = list(TITLES.values())
 TABLES = ("results", "table1", "table2", "stages", "goal_distance")

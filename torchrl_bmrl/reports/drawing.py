@@ -155,7 +155,8 @@ def scatter_by_task(
     order = np.random.default_rng(0).permutation(len(points))
     colors = np.array(task_colors(len(titles)))
     size = float(np.clip(2e4 / max(len(points), 1), 4.0, 25.0))
-    axes.scatter(*points[order].T, c=colors[task[order]], s=size, alpha=0.7, linewidths=0)
+    x, y = points[order].T
+    axes.scatter(x, y, c=colors[task[order]], s=size, alpha=0.7, linewidths=0)
     legend_below(axes, [dot(titles[index], "o", colors[index]) for index in present])
 
 
