@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,6 @@ GREY = "#555555"
 """Colour of what belongs to no task."""
 
 
-@cache
 def task_colors(count: int) -> tuple[str, ...]:
     """Returns distinct colours, by position; the first ones do not depend on the count.
 
