@@ -2,8 +2,8 @@
 
     python docs/make_pictures.py
 
-The way of the data, the six tasks, and the embedding of the policy that the repository holds. Needs
-the extras robosuite and reports, and EGL or OSMesa. The curves of stage 1 are recipes/publish.py's.
+They are the data flow, the six tasks, and the embedding of the policy in this repository. Needs the
+extras robosuite and reports, and EGL or OSMesa. results/publish.py draws the curves of stage 1.
 """
 
 from __future__ import annotations

@@ -336,7 +336,6 @@ def test_tables_leave_out_shares_of_a_return_that_is_not_positive() -> None:
     import comparisons
 
     from torchrl_bmrl.evaluation.results import ResultRow, summarise
-    from torchrl_bmrl.names import TASKS
 
     rows = [
         ResultRow(
@@ -347,7 +346,7 @@ def test_tables_leave_out_shares_of_a_return_that_is_not_positive() -> None:
             episode_return=0.0 if task == "lift" else 1.0,
             success=False,
         )
-        for task in TASKS
+        for task in comparisons.TASKS
         for policy in ("expert", "bcq")
         for i in range(3)
     ]

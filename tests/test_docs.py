@@ -132,7 +132,7 @@ def test_every_command_of_a_recipe_gives_settings_that_it_takes(
 ) -> None:
     """What the recipes then do, test_recipes.py and its like execute at small sizes."""
     recipe = Path(words[1]).stem
-    alone = {"extrapolation": "mujoco", "publish": "matplotlib"}  # have settings of their own
+    alone = {"extrapolation": "mujoco"}  # has settings of its own
     for package in ("hydra", "gymnasium", "h5py", "safetensors", "scipy", "tqdm"):
         pytest.importorskip(package)
     if recipe in alone:
@@ -159,8 +159,7 @@ def test_every_command_of_a_recipe_gives_settings_that_it_takes(
         ]
     with initialize_config_dir(version_base="1.3", config_dir=str(ROOT / "recipes" / "config")):
         # Set first: what it is otherwise is Hydra's to say, in a command.
-        folder = [] if name == "publish" else ["run_dir=runs/mine"]
-        config = compose(name, overrides=[*folder, *options])
+        config = compose(name, overrides=["run_dir=runs/mine", *options])
     config = OmegaConf.to_object(config)
     if recipe == "extrapolation":
         module.check_settings(config)

@@ -23,17 +23,18 @@ for extra in ("scipy", "matplotlib", "jinja2", "sklearn"):
 from PIL import Image
 
 from torchrl_bmrl.errors import BMRLError, DataError, RenderError
-from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports import (
     Embeddings,
     Explorer,
     Section,
+    paper,
     task_colors,
     task_titles,
     write_page,
 )
 
 STEPS = 21
+TASKS = tuple(paper.TABLE_1)
 TASK_COLORS = dict(zip(TASKS, task_colors(len(TASKS)), strict=True))
 EVIL = "</script><script>document.title = 'taken'</script>"
 
@@ -113,6 +114,16 @@ def test_the_order_of_transitions_does_not_matter() -> None:
     shuffled: dict[str, Any] = {name: getattr(explorer, name)[order] for name in columns}
     shuffled["phase"] = [explorer.phase[i] for i in order]
     assert replace(explorer, **shuffled).html() == explorer.html()
+
+
+def test_what_is_unknown_is_null_in_the_data() -> None:
+    rows = 12 * STEPS
+    explorer = make_explorer(
+        distance=np.full(rows, np.nan), success=np.full(rows, None), periods={1: 0.02}
+    )
+    content = content_of(explorer.html())
+    assert {d for e in content["episodes"] for d in e["distance"] + e["success"]} == {None}
+    assert [task["period"] for task in content["tasks"]] == [None, 0.02, None, None, None, None]
 
 
 def test_names_from_data_cannot_leave_the_data() -> None:
@@ -562,6 +573,21 @@ def test_colors_can_show_phase_and_distance(browser: Browser) -> None:
     browser.choose("coloring", "distance to goal")
     assert legend() == ["distance to goal: 0 to 0.50 m"]
     assert browser.pixels("#fde725")  # viridis' far end
+
+
+def test_what_is_unknown_is_a_dash_and_times_are_steps(browser: Browser, tmp_path: Path) -> None:
+    rows = 12 * STEPS
+    explorer = make_explorer(
+        distance=np.full(rows, np.nan), success=np.full(rows, None), periods={}
+    )
+    browser.open(page_of(explorer, tmp_path))
+    browser.wait(lambda: bool(browser.pixels(TASK_COLORS["reach"])))
+    assert (browser.shown("distance"), browser.shown("success")) == ("–", "–")
+    assert browser.shown("time") == browser.part("clock").text == "step 0"
+    assert "distance" not in browser.part("coloring").text
+    browser.part("play").click()
+    browser.wait(lambda: browser.shown("time") == "step 20")
+    assert browser.driver.get_log("browser") == []
 
 
 def test_markup_in_names_is_shown_and_not_run(browser: Browser, tmp_path: Path) -> None:

@@ -287,13 +287,6 @@ def test_texts_get_quotes_and_nothing_else(recipes: Any, line: str, typed: str) 
     assert as_typed(line, configured()) == typed
 
 
-def test_folders_to_publish_are_those_that_were_typed(
-    recipes: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command_line("publish", "runs=[1.10]", f"docs={tmp_path}") == 1
-    assert "error: 1.10/config.yaml: no such file" in capsys.readouterr().err
-
-
 # -- nothing is left -------------------------------------------------------------------------------
 
 
@@ -388,10 +381,10 @@ def test_another_runs_folder_gets_no_locks_of_a_command_that_is_refused(tmp_path
 
 def test_every_recipe_runs_in_a_folder_that_knows_its_settings() -> None:
     mains = [path for path in RECIPES.glob("*.py") if "@hydra.main" in path.read_text()]
-    assert len(mains) > 12
+    assert len(mains) > 11
     for path in mains:
         text = path.read_text()
-        assert path.stem == "publish" or "run_recipe(" in text or "with_folders_settings(" in text
+        assert "run_recipe(" in text or "with_folders_settings(" in text
 
 
 def test_small_runs_settings_are_the_commands_own_without_a_command_line(

@@ -1,4 +1,4 @@
-"""The recipe that publishes: what it takes from run folders, and the command of a run."""
+"""The script that publishes: what it takes from run folders, and the command of a run."""
 
 # ruff: noqa: E402 -- the package's imports need the extras that the skip checks
 from __future__ import annotations
@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import json
 import shlex
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -21,24 +22,26 @@ import yaml
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from published_data import make_rows
-from small_runs import RECIPES, command_line
+from small_runs import RECIPES
+
+# isort: split
+from published import TASKS, read_published
 
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
 from torchrl_bmrl.evaluation import ResultRow, write_results
 from torchrl_bmrl.files import write_rows
-from torchrl_bmrl.names import TASKS
-from torchrl_bmrl.reports.published import read_published
 from torchrl_bmrl.training.checkpoint import save_checkpoint
 
 
 @pytest.fixture
 def publish() -> Iterator[Any]:
-    """The recipe's module, importable as it is for a script beside it."""
+    """The script's module."""
     with (
         pytest.MonkeyPatch.context() as patch,
         initialize_config_dir(str(RECIPES / "config"), version_base="1.3"),
     ):
         patch.syspath_prepend(str(RECIPES))
+        import command  # noqa: F401 -- registers the schema of recipe.yaml
         import publish
 
         yield publish
@@ -75,7 +78,7 @@ def test_a_folder_becomes_rows(publish: Any, tmp_path: Path) -> None:
     run_dir = make_folder(tmp_path / "run", "preset=paper")
     write_results(run_dir / "baselines.csv", rows_of(3, "bc"))
     docs = tmp_path / "docs"
-    publish.publish(publish.Settings(runs=[str(run_dir)], docs=str(docs)))
+    publish.publish([run_dir], docs)
     published = read_published(docs / "results")
     (run,) = published.runs
     assert run.key == ("paper", "none", 3)
@@ -87,16 +90,16 @@ def test_a_folder_becomes_rows(publish: Any, tmp_path: Path) -> None:
     assert [(c.task, c.seed, c.episode_return) for c in published.curves] == [
         (task, 3, 0.333) for task in TASKS
     ]
-    publish.publish(publish.Settings(check=True, docs=str(docs)))
+    publish.check_results_page(docs)
 
 
 @pytest.mark.slow
 def test_publishing_again_changes_nothing(publish: Any, tmp_path: Path) -> None:
-    runs = [str(make_folder(tmp_path / str(s), "preset=paper", seed=s)) for s in (1, 2)]
+    runs = [make_folder(tmp_path / str(s), "preset=paper", seed=s) for s in (1, 2)]
     docs = tmp_path / "docs"
 
-    def published(order: list[str]) -> dict[Path, bytes]:
-        publish.publish(publish.Settings(runs=order, docs=str(docs)))
+    def published(order: list[Path]) -> dict[Path, bytes]:
+        publish.publish(order, docs)
         return {path: path.read_bytes() for path in docs.rglob("*") if path.is_file()}
 
     first = published(runs)
@@ -163,12 +166,12 @@ def test_a_damaged_folder_leaves_what_was_published(
 ) -> None:
     docs = tmp_path / "docs"
     good = make_folder(tmp_path / "good", "preset=paper", seed=1)
-    publish.publish(publish.Settings(runs=[str(good)], docs=str(docs)))
+    publish.publish([good], docs)
     before = {p: p.read_bytes() for p in docs.rglob("*") if p.is_file()}
     bad = make_folder(tmp_path / "bad", "preset=paper", seed=2)
     broken(bad, name, content)
     with pytest.raises(BMRLError, match=name):
-        publish.publish(publish.Settings(runs=[str(bad)], docs=str(docs)))
+        publish.publish([bad], docs)
     assert {p: p.read_bytes() for p in docs.rglob("*") if p.is_file()} == before
 
 
@@ -177,29 +180,36 @@ def test_episodes_of_another_seed_are_refused(publish: Any, tmp_path: Path) -> N
     rows = [replace(row, seed=8) for row in rows_of(3, "expert", "bcq")]
     write_results(run_dir / "results.csv", rows)
     with pytest.raises(DataError, match="seed: 8; the run's is 3"):
-        publish.publish(publish.Settings(runs=[str(run_dir)], docs=str(tmp_path / "docs")))
+        publish.publish([run_dir], tmp_path / "docs")
 
 
 @pytest.mark.slow
 def test_the_check_exits_with_one_line_when_a_number_was_changed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    publish: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     docs = tmp_path / "docs"
-    with initialize_config_dir(str(RECIPES / "config"), version_base="1.3"):
-        run_dir = make_folder(tmp_path / "run", "preset=quick")
+    run_dir = make_folder(tmp_path / "run", "preset=quick")
 
-    def recipe(*overrides: str) -> int:
-        return command_line("publish", *overrides, f"docs={docs}")
+    def command(*words: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["publish.py", *words, f"--docs={docs}"])
+        try:
+            publish.main()
+        except SystemExit as end:
+            return int(end.code or 0)
+        return 0
 
-    assert recipe(f"runs=[{run_dir}]") == 0
-    assert recipe("check=true") == 0
+    assert command(str(run_dir)) == 0
+    assert command("--check") == 0
     path = docs / "results" / "runs.csv"
     with path.open(newline="") as file:
         (row,) = csv.DictReader(file)
     write_rows(path, [row | {"seconds_collect": "999.0"}])
     capsys.readouterr()
-    assert recipe("check=true") == 1
+    assert command("--check") == 1
     said = capsys.readouterr().err
     assert len(said.splitlines()) == 1
     assert said.startswith(f"error: {docs / 'results.md'}: line ")

@@ -20,7 +20,6 @@ for extra in ("scipy", "matplotlib", "jinja2", "sklearn"):
 from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.evaluation import ResultRow, summarise, write_results
 from torchrl_bmrl.evaluation.embedding import STAGE_TAIL
-from torchrl_bmrl.names import TASKS
 from torchrl_bmrl.reports import (
     Embeddings,
     Section,
@@ -51,6 +50,7 @@ from torchrl_bmrl.reports.drawing import _lab
 ARMS = [("expert", ""), ("bcq", ""), ("distilled", "prototype"), ("distilled", "online")]
 
 
+TASKS = tuple(paper.TABLE_1)
 TITLES = task_titles(TASKS)
 NAMES = list(TITLES.values())
 TABLES = ("results", "table1", "table2", "stages", "goal_distance")
@@ -479,6 +479,56 @@ def test_a_whole_report_is_written_and_stands_alone(tmp_path: Path) -> None:
 
 def cells_of(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
+
+
+def test_tasks_without_returns_or_distances_have_a_report(tmp_path: Path) -> None:
+    """A dozen tasks that only have recorded data: no episodes, phases, goals or successes."""
+    rng = np.random.default_rng(0)
+    names = [f"my_tasks:pour_{i}" for i in range(12)]
+    task = np.repeat(np.arange(12), 10)
+    data = Embeddings(
+        tasks=names,
+        task_latent=rng.normal(size=(120, 3)) + task[:, None],
+        task=task,
+        episode=task // 12,
+        step=np.tile(np.arange(10), 12),
+    )
+    table = Table(title="Held-out data", caption="C", header=("Task", "Q"), rows=[("Pour 0", "1")])
+    page = write_report(
+        tmp_path,
+        facts={},
+        titles={names[1]: "Water"},
+        tables={"held_out": table},
+        embeddings=data,
+        training=data,
+        accuracy=0.9,
+    )
+    text = page.read_text(encoding="utf-8")
+    assert "90.0% of the cases." in text  # and not the paper's number
+    assert "Held-out data" in text
+    assert "trajectories are left out: no distance" in text
+    assert (tmp_path / "tables" / "held_out.csv").read_text() == table.csv()
+    assert {p.stem for p in (tmp_path / "tables").iterdir()} == {"held_out"}
+    assert {p.stem for p in (tmp_path / "figures").iterdir()} == {"embedding", "embedding_tsne"}
+
+
+def test_returns_of_other_tasks_stand_alone_and_an_unknown_success_is_a_dash(
+    tmp_path: Path,
+) -> None:
+    rows = [replace(row, success=None) for row in make_rows(("pour", "ant"))]
+    mine = [replace(row, policy="mine") for row in rows if row.policy == "bcq"]
+    write_results(tmp_path / "results.csv", [*rows, *mine])
+    text = write_report(tmp_path, facts={}, titles={"ant": "Ant v5"}).read_text(encoding="utf-8")
+    first = cells_of(tmp_path / "tables" / "table1.csv")
+    assert [line["Task"] for line in first] == ["Ant v5", "Pour"]
+    assert not [name for name in first[0] if name.startswith("Paper")]
+    assert {line["Here: BCQ success"] for line in first} == {"–"}
+    assert first[1]["Here: BCQ"] == f"{mean(rows, 'pour', 'bcq'):.1f}"
+    lines = cells_of(tmp_path / "tables" / "results.csv")
+    assert {(line["Success"], line["Success 95% interval"]) for line in lines} == {("–", "–")}
+    assert [line["Policy"] for line in lines if line["Task"] == "Pour"][-1] == "mine"
+    assert "solved" not in text
+    assert "The distilled policy&#39;s return is between" in text
 
 
 def test_the_summary_counts_the_successes(tmp_path: Path) -> None:

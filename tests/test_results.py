@@ -20,8 +20,8 @@ from torchrl_bmrl.evaluation.results import (
     write_results,
 )
 from torchrl_bmrl.evaluation.statistics import bootstrap_interval
-from torchrl_bmrl.names import TASKS
 
+TASKS = ("reach", "lift", "push_right", "push_left", "push_up", "push_down")
 ROW = ResultRow(task="lift", policy="bcq", seed=1, episode=2, episode_return=3.5, success=True)
 LINE = {
     "task": "reach",

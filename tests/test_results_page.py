@@ -250,25 +250,25 @@ def test_sections_without_data_are_left_out() -> None:
 
 @pytest.mark.robosuite
 def test_what_the_page_says_of_rewards_and_experts_is_so() -> None:
-    from torchrl_bmrl.envs import tasks
+    from torchrl_bmrl.envs import scene, skills
     from torchrl_bmrl.experts import controllers
 
     text = " ".join(make_results_page(Published()).text.split())
-    low, high = tasks.REACH_GOAL_LOW, tasks.REACH_GOAL_HIGH
-    farthest = np.maximum(high - tasks.REACH_START, tasks.REACH_START - low)
-    farthest = np.linalg.norm(farthest) + tasks.REACH_START_RADIUS
-    still = tasks.push_velocity_reward(np.zeros(3), np.array([1.0, 0.0, 0.0]))
-    hover = tasks.reach_reward(tasks.HOVER_HEIGHT)
+    low, high = scene.TARGET_LOW, scene.TARGET_HIGH
+    farthest = np.maximum(high - scene.HOME, scene.HOME - low)
+    farthest = np.linalg.norm(farthest) + scene.HOME_RADIUS
+    still = skills.push_velocity_reward(np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    hover = skills.reach_reward(scene.HOVER_HEIGHT)
     gains = controllers.ExpertGains()
-    assert f"{hover:.2f} at 10 cm, {tasks.reach_reward(0.05):.3f} at 5 cm" in text
+    assert f"{hover:.2f} at 10 cm, {skills.reach_reward(0.05):.3f} at 5 cm" in text
     assert "box of {:.0f} × {:.0f} × {:.0f} cm".format(*(100 * (high - low))) in text
-    assert np.all((low < tasks.REACH_START) & (high > tasks.REACH_START))
+    assert np.all((low < scene.HOME) & (high > scene.HOME))
     assert farthest < 0.29
-    assert tasks.reach_reward(farthest) > 0.3
-    assert tasks.reach_reward(0.21) == pytest.approx(
+    assert skills.reach_reward(farthest) > 0.3
+    assert skills.reach_reward(0.21) == pytest.approx(
         paper.TABLE_1["reach"].expert_return / 200, abs=0.01
     )
     assert f"cube at rest is {still:.2f}" in text
     assert f"return {200 * hover:.0f} on lift and {200 * (hover + still):.0f} on a push" in text
     assert (gains.speed_limit, gains.contact_speed_limit) == (1.0, 0.7)
-    assert (controllers.POSITION_SCALE, 1 / tasks.CONTROL_FREQUENCY) == (0.05, 0.05)
+    assert (controllers.POSITION_SCALE, 1 / scene.CONTROL_FREQUENCY) == (0.05, 0.05)

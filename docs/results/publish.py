@@ -114,8 +114,8 @@ def command_of(settings: Mapping[str, Any]) -> str:
         ConfigError: if the preset, the ablation or a setting of the run no longer exists.
     """
     sys.path.append(str(RECIPES))
+    import command  # noqa: F401 -- registers the schema of recipe.yaml
     import hydra
-    import settings as recipe_settings  # noqa: F401 -- registers the schema of recipe.yaml
     from hydra.core.global_hydra import GlobalHydra
     from omegaconf import OmegaConf
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,6 @@ GREY = "#555555"
 """Colour of what belongs to no task."""
 
 
-@cache
 def task_colors(count: int) -> tuple[str, ...]:
     """Returns distinct colours, by position; the first ones do not depend on the count.
 
@@ -155,14 +153,23 @@ def scatter_by_task(
     order = np.random.default_rng(0).permutation(len(points))
     colors = np.array(task_colors(len(titles)))
     size = float(np.clip(2e4 / max(len(points), 1), 4.0, 25.0))
-    axes.scatter(*points[order].T, c=colors[task[order]], s=size, alpha=0.7, linewidths=0)
+    x, y = points[order].T
+    axes.scatter(x, y, c=colors[task[order]], s=size, alpha=0.7, linewidths=0)
     legend_below(axes, [dot(titles[index], "o", colors[index]) for index in present])
 
 
 def dot(label: str, marker: str, color: str, *, edge: str = "none", size: float = 7) -> Line2D:
     """Makes a legend entry: a single marker."""
-    style = {"marker": marker, "color": color, "markeredgecolor": edge, "markersize": size}
-    return Line2D([], [], label=label, linestyle="none", **style)
+    return Line2D(
+        [],
+        [],
+        label=label,
+        linestyle="none",
+        marker=marker,
+        color=color,
+        markeredgecolor=edge,
+        markersize=size,
+    )
 
 
 def legend_below(axes: Axes, handles: list[Any]) -> None:

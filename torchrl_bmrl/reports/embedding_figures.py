@@ -144,7 +144,7 @@ def embedding_stages(
         (right, named[stage[chosen]], "group found without labels"),
     ):
         tidy(axes)
-        axes.scatter(*points.T, c=colors[label], s=12, alpha=0.8, linewidths=0)
+        axes.scatter(points[:, 0], points[:, 1], c=colors[label], s=12, alpha=0.8, linewidths=0)
         axes.set_title(title, fontsize=11)
         axes.set_xlabel("t-SNE 1 (no unit)")
     left.set_ylabel("t-SNE 2 (no unit)")
