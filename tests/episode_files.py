@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,25 @@ def write_file(
         masks={"train": range(train), "valid": range(train, len(lengths))},
     )
     return episodes
+
+
+def readers(open_data: Any) -> tuple[Any, Any, Any]:
+    """Functions that return the episodes, the metadata and the oddities of a data set alone."""
+
+    @contextmanager
+    def open_raw(path: Path, **options: Any) -> Iterator[Mapping[str, Any]]:
+        with open_data(path, **options) as opened:
+            yield opened.episodes
+
+    def read_metadata(path: Path, **options: Any) -> dict[str, Any]:
+        with open_data(path, **options) as opened:
+            return opened.metadata
+
+    def find_oddities(path: Path, **options: Any) -> list[str]:
+        with open_data(path, **options) as opened:
+            return list(opened.oddities)
+
+    return open_raw, read_metadata, find_oddities
 
 
 def assert_same(read: Episode, made: Episode) -> None:

@@ -118,7 +118,8 @@ def test_a_control_rate_that_nobody_tells_is_asked_for(path: Path, tmp_path: Pat
     convert(path, tmp_path / "le", to="lerobot", fps=10)
     assert json.loads((tmp_path / "le" / "meta" / "info.json").read_text())["fps"] == 10
     convert(path, tmp_path / "sawyer" / "a-v0", to="minari")
-    assert "fps" not in minari.read_metadata(tmp_path / "sawyer" / "a-v0")
+    with minari.open_data(tmp_path / "sawyer" / "a-v0") as opened:
+        assert "fps" not in opened.metadata
 
 
 def test_the_control_rate_survives_minari(tmp_path: Path) -> None:

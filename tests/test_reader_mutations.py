@@ -524,13 +524,12 @@ class Mutator:
 
     def read(self) -> tuple[dict[str, RawEpisode], list[str]]:
         module, source = self.layout.module, self.layout.source
-        with module.open_raw(source) as episodes:
-            raws = dict(episodes)
+        with module.open_data(source) as opened:
+            raws = dict(opened.episodes)
         for name, raw in raws.items():
             if raw.rewards is None:
                 complete(self.layout.file, name, raw, ReadOptions())
-        module.read_metadata(source)
-        return raws, module.find_oddities(source)
+        return raws, list(opened.oddities)
 
     def bytes(self, kind: str, seed: int) -> Outcome:
         """A mutation of bytes: whatever loads is the original."""

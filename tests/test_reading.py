@@ -301,7 +301,7 @@ def test_what_other_tools_keep_stops_nothing_and_is_named(tmp_path: Path, capsys
     assert data.exclude("next").keys() == {"x", "action", "episode", "step"}
     code, out, err = checked(path, capsys)
     assert (code, err) == (0, "")
-    assert "beside the demonstrations: data/config, data/index, extra" in out
+    assert "beside the demonstrations, not read: data/config, data/index, extra" in out
     for name in ("obs/datagen_info", "obs/language", "states", "note", "next_obs/more"):
         assert f"{name} (4x)" in out, name
 
@@ -325,7 +325,7 @@ def test_attributes_that_contradict_the_arrays_are_said_and_not_believed(
     code, out, _ = checked(path, capsys)
     assert code == 0
     assert "num_samples contradicts the arrays in 4 episodes, such as demo_0 says 19 of 20" in out
-    assert "total says 3 steps, the arrays have 80" in out
+    assert "total is 3 steps, but the arrays have 80" in out
     assert len(load(path)) == EPISODES * STEPS
     notes = convert(path, tmp_path / "b.hdf5", to="robomimic").notes
     assert any("num_samples" in note for note in notes)
@@ -581,7 +581,7 @@ def test_a_data_set_that_is_named_nearly_like_a_demonstration_is_left_alone(
         file[f"data/{name}"] = np.zeros(4)
     code, out, _ = checked(path, capsys)
     assert code == 0
-    assert f"left alone, beside the demonstrations: data/{name}" in out
+    assert f"beside the demonstrations, not read: data/{name}" in out
 
 
 @pytest.mark.parametrize("value", ["20", 20.0, np.array([20])])

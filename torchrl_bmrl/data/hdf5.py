@@ -10,12 +10,16 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_bmrl.data.arrays import refuse_pointer
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.extras import needs
 
 with needs("data"):
     import h5py
 
+VERSION = ("v110", "v110")
+"""HDF5's structures to write: the default ones have no checksums, and "latest" could only be read
+by the version that wrote it."""
 DAMAGE = (OSError, RuntimeError, KeyError, TypeError, ValueError, MemoryError)
 """What h5py raises on a damaged file, depending on where the damage is."""
 
@@ -26,20 +30,16 @@ def open_file(path: str | Path) -> h5py.File:
     Raises:
         DataError: if it is missing, no whole HDF5 file, or a git-LFS pointer to one.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise DataError(path, None, "a folder; valid: a file" if path.is_dir() else "no such file")
     try:
-        with path.open("rb") as file:
-            pointer = file.read(23) == b"version https://git-lfs"
-        if not pointer:
-            return h5py.File(path, "r")
+        refuse_pointer(Path(path))
+        return h5py.File(path, "r")
+    except DataError:
+        raise
     except DAMAGE as error:
         if isinstance(error, BlockingIOError):  # HDF5's lock
             message = "in use: another process has it open for writing; valid: a closed file"
             raise DataError(path, None, message) from error
         raise DataError(path, None, f"not a whole HDF5 file ({error})") from error
-    raise DataError(path, None, "a git-LFS pointer, not the data; `git lfs pull` fetches them")
 
 
 def read_names(path: str | Path, file: h5py.File, key: str) -> list[str]:
@@ -169,6 +169,23 @@ def read_attribute(path: str | Path, file: h5py.File, key: str, name: str) -> An
         return _plain(file[key].attrs.get(name))
     except DAMAGE as error:
         raise DataError(path, key, f"attribute {name} unreadable ({error})") from error
+
+
+def has_rows(node: Any, *counts: int) -> bool:
+    """Whether a node is an array of numbers with one of these numbers of rows."""
+    if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "biuf":
+        return False
+    return bool(node.ndim and node.size) and node.shape[0] in counts
+
+
+def write_array(group: h5py.Group, key: str, array: np.ndarray, **options: Any) -> None:
+    """Writes a compressed array with checksums.
+
+    The checksum of zeros is zero, so a hole in a file would pass for data; compressed zeros differ
+    from a hole. An array without elements has no chunks, which checksums and filters need.
+    """
+    filters = {"compression": "gzip", "compression_opts": 1, "fletcher32": True, **options}
+    group.create_dataset(key, data=array, **(filters if array.size else {}))
 
 
 def write_attributes(group: h5py.Group, attributes: Mapping[str, Any]) -> None:

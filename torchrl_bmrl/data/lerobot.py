@@ -42,7 +42,6 @@ def write_episodes(
     *,
     fps: float,
     task: str,
-    robot_type: str | None = None,
 ) -> None:
     """Writes a whole data set, or none.
 
@@ -57,7 +56,6 @@ def write_episodes(
         episodes: of equal parts, shapes and dtypes, consumed one at a time.
         fps: steps per second [Hz].
         task: what the robot does, in words.
-        robot_type: such as ``"sawyer"``.
 
     Raises:
         DataError: if the folder exists, without episodes, and for an episode that cannot be kept:
@@ -90,7 +88,7 @@ def write_episodes(
         _write_meta(folder / "meta", rows, task)
         info = {
             "codebase_version": "v3.0",
-            "robot_type": robot_type,
+            "robot_type": None,
             "total_episodes": len(rows),
             "total_frames": rows[-1]["dataset_to_index"],
             "total_tasks": 1,

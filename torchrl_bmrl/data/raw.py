@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -48,6 +48,25 @@ class RawEpisode:
         if successes is None:
             return as_success(self.attributes.get("success"))
         return bool(np.any(successes))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Opened:
+    """A data set that the reader of its format has opened.
+
+    Attributes:
+        episodes: by name; each is read on access, while the data set is open.
+        metadata: what the data set states about itself.
+        prefix: of the episodes' names inside the file, for messages.
+        problems: faults outside the episodes: key and message of each.
+        oddities: warnings about the data set as a whole.
+    """
+
+    episodes: Mapping[str, RawEpisode]
+    metadata: dict[str, Any]
+    prefix: str = ""
+    problems: Sequence[tuple[str, str]] = ()
+    oddities: Sequence[str] = ()
 
 
 def complete(path: str | Path, name: str, raw: RawEpisode, options: ReadOptions) -> Episode:

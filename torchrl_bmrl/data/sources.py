@@ -17,7 +17,7 @@ from torchrl_bmrl.data.account import Account
 from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
 from torchrl_bmrl.data.hdf5 import open_file, read_names
 from torchrl_bmrl.data.options import Bounds, ReadOptions, check_bounds
-from torchrl_bmrl.data.raw import RawEpisode, complete, success_fault
+from torchrl_bmrl.data.raw import Opened, RawEpisode, complete, success_fault
 from torchrl_bmrl.errors import ConfigError, DataError
 
 _STRUCTURE = (
@@ -82,17 +82,6 @@ class Source:
         """
         for key, message in self.problems:
             raise DataError(self.path, key, message)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Opened:
-    """What a format's reader knows of a data set."""
-
-    episodes: Mapping[str, RawEpisode]
-    metadata: dict[str, Any]
-    prefix: str = ""
-    problems: Sequence[tuple[str, str]] = ()
-    oddities: Sequence[str] = ()
 
 
 def find_format(path: Path) -> str:
@@ -171,7 +160,7 @@ def open_source(
         raise ConfigError(f"horizon is for D4RL's files; {path} is {form}'s")
     with ExitStack() as stack:
         if form == "robomimic":
-            opened = _open_robomimic(stack, path, chosen, to_train)
+            opened = stack.enter_context(robomimic.open_data(path, chosen, to_train=to_train))
         elif form == "robosuite":
             opened = _open_robosuite(stack, path, task, tracking)
         else:
@@ -203,7 +192,7 @@ def open_sources(
         yield sources
 
 
-def _apply(path: Path, form: str, opened: _Opened, options: ReadOptions) -> Source:
+def _apply(path: Path, form: str, opened: Opened, options: ReadOptions) -> Source:
     """Applies the options to what a format's reader has opened."""
     account = Account()
     names = _choose(path, opened, options, account)
@@ -237,7 +226,7 @@ def _apply(path: Path, form: str, opened: _Opened, options: ReadOptions) -> Sour
     )
 
 
-def _choose(path: Path, opened: _Opened, options: ReadOptions, account: Account) -> list[str]:
+def _choose(path: Path, opened: Opened, options: ReadOptions, account: Account) -> list[str]:
     """Names of the episodes to read: all, or those that succeeded."""
     if not options.successful:
         return list(opened.episodes)
@@ -284,27 +273,12 @@ def range_of_actions(episodes: Mapping[str, Episode | RawEpisode], names: Iterab
     return check_bounds((low, high))
 
 
-def _open_robomimic(stack: ExitStack, path: Path, options: ReadOptions, to_train: bool) -> _Opened:
-    episodes = robomimic.open_raw(
-        path, options, extras=["successes"] if to_train else None, attributes=not to_train
-    )
-    return _Opened(
-        episodes=stack.enter_context(episodes),
-        metadata=robomimic.read_metadata(path),
-        prefix="data/",
-        problems=robomimic.find_mask_problems(path),
-        oddities=robomimic.find_oddities(path),
-    )
-
-
-def _open_other(stack: ExitStack, path: Path, form: str, options: ReadOptions) -> _Opened:
+def _open_other(stack: ExitStack, path: Path, form: str, options: ReadOptions) -> Opened:
     reader: Any = {"minari": minari, "d4rl": d4rl, "lerobot": lerobot_reader}[form]
     further = {"horizon": options.horizon} if form == "d4rl" else {}
-    episodes = stack.enter_context(reader.open_raw(path, **further))
-    told = reader.read_metadata(path)
-    if form == "d4rl":  # whose own are below these names
-        told = told["attributes"] | told["metadata"]
-    # As gymnasium's environments are in robomimic's layout.
+    opened: Opened = stack.enter_context(reader.open_data(path, **further))
+    told = opened.metadata
+    # As robomimic's layout describes gymnasium's environments.
     env_args = {"env_name": told.get("dataset_id", path.stem), "type": 2, "env_kwargs": {}}
     kept = {
         key: value
@@ -313,11 +287,7 @@ def _open_other(stack: ExitStack, path: Path, form: str, options: ReadOptions) -
     }
     if form == "minari" and "action_bounds" in told:
         kept["action_bounds"] = told["action_bounds"]
-    return _Opened(
-        episodes=episodes,
-        metadata={**kept, "env_args": env_args},
-        oddities=reader.find_oddities(path, **further),
-    )
+    return replace(opened, metadata={**kept, "env_args": env_args})
 
 
 def _fits_attribute(value: Any) -> bool:
@@ -326,7 +296,7 @@ def _fits_attribute(value: Any) -> bool:
     return any(all(isinstance(x, kind) for x in values) for kind in (str, int | float))
 
 
-def _open_robosuite(stack: ExitStack, path: Path, task: str | None, tracking: float) -> _Opened:
+def _open_robosuite(stack: ExitStack, path: Path, task: str | None, tracking: float) -> Opened:
     if task is None:
         raise ConfigError(
             f"{path} holds simulator states alone; valid: --task, the task whose scene it is"
@@ -340,7 +310,7 @@ def _open_robosuite(stack: ExitStack, path: Path, task: str | None, tracking: fl
         kept = {key: value for key, value in vars(episode).items() if key != "left_out"}
         return RawEpisode(**kept)
 
-    return _Opened(
+    return Opened(
         episodes=LazyEpisodes(episodes, read),
         metadata={"env_args": robosuite_metadata(task), "task": task},
         prefix="data/",
