@@ -185,7 +185,7 @@ def test_unknown_formats_and_options_that_do_not_fit_are_named(path: Path, tmp_p
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match=r"empty: a folder without data/main_data\.hdf5"):
         convert(tmp_path / "empty", tmp_path / "a", to="robomimic")
-    with pytest.raises(ConfigError, match=r"task and tracking are for .*robomimic's"):
+    with pytest.raises(ConfigError, match=r"task and tracking are for .* has the format robomimic"):
         convert(path, tmp_path / "a", to="robomimic", task="lift")
     with h5py.File(tmp_path / "other.hdf5", "w") as file:
         file["data/demo_0/actions"] = np.zeros((3, 7))

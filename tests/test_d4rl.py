@@ -440,7 +440,7 @@ REFUSED: dict[str, tuple[Callable[[dict[str, Any]], dict[str, Any]], str]] = {
     ),
     "no part": (
         lambda a: {"observations": None, "observations/x": [b"a"] * N},
-        "observations: no part of an observation; valid: at least one",
+        "observations: no part of the observation; valid: at least one",
     ),
     "a part without a next one": (
         lambda a: {

@@ -523,7 +523,7 @@ def test_bounds_that_do_not_fit_are_refused(root: Path) -> None:
         write_episodes(root / ID, make_episodes(), bounds=(-0.1, 0.1))
     with pytest.raises(ConfigError, match=r"bounds is .*; valid: two finite numbers"):
         write_episodes(root / ID, make_episodes(), bounds=(1, -1))
-    with pytest.raises(DataError, match=r"episode_0/actions: shape \(5, 7\), and bounds of 2"):
+    with pytest.raises(DataError, match=r"episode_0/actions: shape \(5, 7\), but bounds of 2"):
         write_episodes(root / ID, make_episodes(), bounds=([-1, -1], 1))
     assert list((root / "sawyer").iterdir()) == []
 
@@ -685,8 +685,8 @@ POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n"
 DAMAGES: dict[str, tuple[Damage, str]] = {
     "no numbers": (overwrite("main_data.hdf5", None), "main_data.hdf5: no such file"),
     "no metadata": (overwrite("metadata.json", None), "metadata.json: no such file"),
-    "empty file": (overwrite("main_data.hdf5", b""), "main_data.hdf5: not a whole HDF5 file"),
-    "truncated file": (truncate, "main_data.hdf5: not a whole HDF5 file"),
+    "empty file": (overwrite("main_data.hdf5", b""), "main_data.hdf5: not a complete HDF5 file"),
+    "truncated file": (truncate, "main_data.hdf5: not a complete HDF5 file"),
     "pointer": (overwrite("main_data.hdf5", POINTER), "main_data.hdf5: a git-LFS pointer"),
     "pointer of metadata": (overwrite("metadata.json", POINTER), "metadata.json: a git-LFS"),
     "half metadata": (overwrite("metadata.json", b'{"total'), "metadata.json: not Minari's"),

@@ -503,7 +503,7 @@ def test_a_folder_is_not_a_file(tmp_path: Path) -> None:
 def test_another_format_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "lift.hdf5"
     path.write_bytes(content)
-    assert "not a whole HDF5 file" in str(refusal(path))
+    assert "not a complete HDF5 file" in str(refusal(path))
 
 
 def test_a_pointer_to_git_lfs_says_how_to_get_the_data(tmp_path: Path) -> None:
@@ -516,9 +516,9 @@ def test_a_pointer_to_git_lfs_says_how_to_get_the_data(tmp_path: Path) -> None:
 def test_a_truncated_file_is_refused(path: Path, share: float) -> None:
     whole = path.read_bytes()
     path.write_bytes(whole[: int(share * len(whole))])
-    assert "not a whole HDF5 file" in str(refusal(path))
+    assert "not a complete HDF5 file" in str(refusal(path))
     for reader in READERS:
-        with pytest.raises(DataError, match="not a whole HDF5 file"):
+        with pytest.raises(DataError, match="not a complete HDF5 file"):
             reader(path)
 
 

@@ -485,7 +485,7 @@ def test_a_missing_model_attribute_is_refused(copy: Path) -> None:
     ("content", "message"),
     [
         (None, "no such file"),
-        (b"", "not a whole HDF5 file"),
+        (b"", "not a complete HDF5 file"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "git-LFS"),
     ],
 )

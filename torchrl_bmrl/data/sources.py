@@ -1,4 +1,4 @@
-"""Any of the formats, opened: what is in it, by which rules it is read, what is wrong with it."""
+"""Opens data sets of any format."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _STRUCTURE = (
     *("dataset_size", "env_args", "env_spec", "masks", "minari_version", "total"),
     *("total_episodes", "total_steps"),
 )
-"""What formats say of their own files, and names that have a meaning of their own here."""
+"""Metadata that describe the file itself, and names with a meaning of their own here."""
 
 FORMATS = ("robomimic", "robosuite", "minari", "d4rl", "lerobot")
 
@@ -37,17 +37,17 @@ class Source:
     Attributes:
         path: of the file or folder.
         format: one of :data:`FORMATS`.
-        episodes: by name, each read when it is asked for.
-        options: by which they are read.
+        episodes: by name; each is read on access.
+        options: how they are read.
         prefix: of the names inside the file, for messages.
         bounds: of floating-point actions: those of the options, else those that the data set
             states, else [-1, 1].
         bounds_stated: whether the options or the data set state these bounds.
         metadata: attributes of the file, ``env_args`` and ``masks`` among them, and
-            ``action_bounds`` where they are not [-1, 1].
-        account: knows the episodes that are left out; whoever reads the others adds them.
-        problems: what is wrong beside the episodes: key and message.
-        oddities: what deserves a look beside them.
+            ``action_bounds`` if they are not [-1, 1].
+        account: counts the episodes that are left out.
+        problems: faults outside the episodes: key and message of each.
+        oddities: warnings about the data set as a whole.
     """
 
     path: Path
@@ -64,7 +64,7 @@ class Source:
 
     @property
     def fps(self) -> float | None:
-        """Steps per second [Hz], where the data set tells them."""
+        """Steps per second [Hz]; ``None`` if the data set does not state it."""
         kwargs = self.metadata.get("env_args", {}).get("env_kwargs")
         rate = kwargs.get("control_freq") if isinstance(kwargs, dict) else None
         for known in (self.metadata.get("fps"), rate):
@@ -75,7 +75,7 @@ class Source:
         return None
 
     def check(self) -> None:
-        """Refuses a data set in which something is wrong beside the episodes.
+        """Refuses a data set with faults outside the episodes.
 
         Raises:
             DataError: for the first of :attr:`problems`.
@@ -104,7 +104,7 @@ def find_format(path: Path) -> str:
         for name in read_names(path, file, "data"):
             try:
                 present = read_names(path, file, f"data/{name}")
-            except DataError:  # whoever reads it says what is wrong
+            except DataError:  # reported when it is read
                 continue
             if "obs" in present:
                 return "robomimic"
@@ -126,16 +126,17 @@ def open_source(
 
     Args:
         path: an HDF5 file, or the folder of a Minari or LeRobot data set.
-        task: whose scene a robosuite ``demo.hdf5`` was recorded in: it holds states alone.
+        task: the task in whose scene a robosuite ``demo.hdf5``, which only has simulator states,
+            was recorded.
         tracking: see :func:`torchrl_bmrl.data.robosuite.open_episodes`.
-        to_train: reads only what trains: of a file in robomimic's layout neither the episodes'
-            attributes nor, ``successes`` apart, their extras.
+        to_train: whether to skip what training does not need in a file in robomimic's layout:
+            attributes of the episodes, and extras except ``successes``.
         options: see :class:`~torchrl_bmrl.data.options.ReadOptions`.
 
     Raises:
         DataError: for a missing or damaged data set.
-        ConfigError: for a robosuite file without ``task``, and for options that are invalid or that
-            another format has no use for.
+        ConfigError: for a robosuite file without ``task``, and for options that are invalid or do
+            not apply to the format.
 
     Example:
         >>> import tempfile
@@ -153,11 +154,15 @@ def open_source(
     chosen = ReadOptions(**options)
     form = find_format(path)
     if form != "robosuite" and (task is not None or tracking != 1.0):
-        raise ConfigError(f"task and tracking are for robosuite's demo.hdf5; {path} is {form}'s")
+        raise ConfigError(
+            f"task and tracking are for robosuite's demo.hdf5; {path} has the format {form}"
+        )
     if chosen.split is not None and form != "robomimic":
-        raise ConfigError(f"split is {chosen.split!r}, but {path} is {form}'s, which has no masks")
+        raise ConfigError(
+            f"split is {chosen.split!r}, but {path} has the format {form}, without masks"
+        )
     if chosen.horizon is not None and form != "d4rl":
-        raise ConfigError(f"horizon is for D4RL's files; {path} is {form}'s")
+        raise ConfigError(f"horizon is for D4RL's files; {path} has the format {form}")
     with ExitStack() as stack:
         if form == "robomimic":
             opened = stack.enter_context(robomimic.open_data(path, chosen, to_train=to_train))
@@ -172,7 +177,7 @@ def open_source(
 def open_sources(
     source: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], **options: Any
 ) -> Iterator[list[Source]]:
-    """Opens one or several data sets, and refuses those with problems beside their episodes.
+    """Opens one or several data sets, and refuses those with faults outside the episodes.
 
     Args:
         source: a path as for :func:`open_source`, or several.
@@ -193,7 +198,7 @@ def open_sources(
 
 
 def _apply(path: Path, form: str, opened: Opened, options: ReadOptions) -> Source:
-    """Applies the options to what a format's reader has opened."""
+    """Applies the options to a data set that its reader has opened."""
     account = Account()
     names = _choose(path, opened, options, account)
     metadata = dict(opened.metadata)
@@ -227,14 +232,14 @@ def _apply(path: Path, form: str, opened: Opened, options: ReadOptions) -> Sourc
 
 
 def _choose(path: Path, opened: Opened, options: ReadOptions, account: Account) -> list[str]:
-    """Names of the episodes to read: all, or those that succeeded."""
+    """Names of the episodes to read: all, or the successful ones."""
     if not options.successful:
         return list(opened.episodes)
     names = []
     for name in opened.episodes:
         try:
             raw = opened.episodes[name]
-        except DataError:  # found again, and reported, when it is read
+        except DataError:  # reported when it is read
             names.append(name)
             continue
         if raw.succeeded is None:
@@ -245,7 +250,7 @@ def _choose(path: Path, opened: Opened, options: ReadOptions, account: Account) 
         else:
             account.add_failure(raw, options)
     if not names:
-        raise DataError(path, None, f"no episode succeeded of {len(opened.episodes)}")
+        raise DataError(path, None, f"none of {len(opened.episodes)} episodes succeeded")
     return names
 
 
@@ -264,7 +269,7 @@ def range_of_actions(episodes: Mapping[str, Episode | RawEpisode], names: Iterab
             each = 0 if actions.ndim == 2 else None
             low = np.minimum(low, actions.min(axis=each)).astype(np.float64)
             high = np.maximum(high, actions.max(axis=each)).astype(np.float64)
-        except (DataError, ValueError):  # found again, and reported, when it is read
+        except (DataError, ValueError):  # reported when it is read
             continue
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         return -1.0, 1.0
@@ -291,7 +296,7 @@ def _open_other(stack: ExitStack, path: Path, form: str, options: ReadOptions) -
 
 
 def _fits_attribute(value: Any) -> bool:
-    """Whether it is a number, a text, or a list of one of both."""
+    """Whether a value is a number, a text, or a list of numbers or of texts."""
     values = value if isinstance(value, list) else [value]
     return any(all(isinstance(x, kind) for x in values) for kind in (str, int | float))
 
@@ -299,7 +304,7 @@ def _fits_attribute(value: Any) -> bool:
 def _open_robosuite(stack: ExitStack, path: Path, task: str | None, tracking: float) -> Opened:
     if task is None:
         raise ConfigError(
-            f"{path} holds simulator states alone; valid: --task, the task whose scene it is"
+            f"{path} only has simulator states; valid: --task, the task of the recorded scene"
         )
     from torchrl_bmrl.envs.robosuite_names import robosuite_metadata
 
@@ -359,12 +364,12 @@ def with_joint_range(sources: Sequence[Source]) -> list[Source]:
         return list(sources)
     try:
         return with_bounds(sources, join_bounds([source.bounds for source in sources]))
-    except ConfigError:  # whoever reads the episodes reports actions of different sizes
+    except ConfigError:  # different sizes are reported when the episodes are read
         return list(sources)
 
 
 def _equal(one: Bounds, other: Bounds) -> bool:
-    """Whether bounds are equal, one number for all dimensions or one for each."""
+    """Whether bounds are equal, whether given as one number or as one for each dimension."""
     try:
         return bool(np.all(np.equal(one[0], other[0])) and np.all(np.equal(one[1], other[1])))
     except ValueError:
@@ -372,16 +377,16 @@ def _equal(one: Bounds, other: Bounds) -> bool:
 
 
 def joined(sources: Sequence[Source]) -> Mapping[str, Any]:
-    """Metadata of several sources together: what they agree in, and masks by name.
+    """Metadata that several sources have in common, and their masks joined by name.
 
     Raises:
-        ConfigError: for bounds of actions that differ.
+        ConfigError: for different bounds of the actions.
     """
     first = sources[0]
     if wrong := [source for source in sources if not _equal(source.bounds, first.bounds)]:
         raise ConfigError(
-            f"actions of {wrong[0].path} are bounded by {wrong[0].bounds}, those of {first.path} "
-            f"by {first.bounds}; valid: equal bounds, such as bounds= for all"
+            f"the actions of {wrong[0].path} have bounds {wrong[0].bounds}, those of {first.path} "
+            f"{first.bounds}; valid: equal bounds, such as bounds= for all"
         )
     metadata = {
         key: value
@@ -395,7 +400,7 @@ def joined(sources: Sequence[Source]) -> Mapping[str, Any]:
         positions = {name: start + i for i, name in enumerate(source.episodes)}
         start += len(positions)
         for mask, chosen in source.metadata.get("masks", {}).items():
-            # Of some of the episodes a mask keeps what is left of its own.
+            # A mask keeps those of its episodes that are read.
             masks.setdefault(mask, []).extend(
                 positions[name] for name in chosen if name in positions
             )
