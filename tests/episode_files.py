@@ -12,13 +12,22 @@ import numpy as np
 
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import write_episodes
-from torchrl_bmrl.data.schema import OBSERVATION_SHAPES, arrays_of
+from torchrl_bmrl.data.schema import arrays_of
 
 Parts = Mapping[str, tuple[tuple[int, ...], Any]]
 """Shape of a row and dtype of each part of an observation."""
 
 PARTS: Parts = {"object": ((10,), np.float64), "image": ((8, 8, 3), np.uint8)}
 """Not the six tasks': any robot's observations will do."""
+OBSERVATION_SHAPES: dict[str, int] = {
+    "robot0_joint_pos": 7,
+    "robot0_gripper_qpos": 2,
+    "robot0_joint_vel": 7,
+    "robot0_eef_pos": 3,
+    "robot0_eef_quat": 4,
+    "goal_pos": 3,
+}
+"""Parts of the six tasks' observation and their sizes, in the order of the environment."""
 TASK_PARTS: Parts = {name: ((size,), np.float64) for name, size in OBSERVATION_SHAPES.items()}
 LENGTHS = (5, 6, 7, 8)
 ENV_ARGS = {"env_name": "BMRLSawyerLift", "type": 1, "env_version": "1", "env_kwargs": {"a": 1}}

@@ -417,7 +417,7 @@ BAD_STATES = {
         "in row 9; valid: forward",
     ),
     "a gap": (lambda states: np.delete(states, range(20, 40), axis=0), "in row 20; valid"),
-    "no quaternion": (set_value((4, 13), 3.0), "no unit quaternion in row 4"),
+    "no quaternion": (set_value((4, 13), 3.0), "not a unit quaternion in row 4"),
 }
 
 

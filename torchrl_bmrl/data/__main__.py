@@ -146,8 +146,8 @@ def reading_options() -> argparse.ArgumentParser:
     group.add_argument(
         "--last-step",
         choices=get_args(LastStep),
-        help="treatment of a last step after which no observation was recorded: leave it out (drop), "
-        "or keep it, repeat its observation, and bootstrap (truncate) or not (terminate)",
+        help="treatment of a last step without an observation after it: leave it out (drop), or "
+        "keep it, repeat its observation, and bootstrap (truncate) or not (terminate)",
     )
     group.add_argument(
         "--dones-terminate", action="store_true", help="dones at the last step is a termination"

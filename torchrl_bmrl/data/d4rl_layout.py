@@ -150,7 +150,7 @@ def _find_parts(path: str | Path, file: h5py.File, key: str) -> tuple[dict[str, 
         else:
             beside.append(f"{key}/{part}")
     if not parts:
-        raise DataError(path, key, "no part of an observation; valid: at least one")
+        raise DataError(path, key, "no part of the observation; valid: at least one")
     return parts, beside
 
 

@@ -9,7 +9,8 @@ Layout of a data set's folder::
     meta/episodes/chunk-000/file-000.parquet   a row for each episode, its statistics among them
 
 The layout loses the observation after the last step, and the precision of float64: only indices and
-flags are not float32. Minari's layout loses neither. :mod:`torchrl_bmrl.data.lerobot_reader` reads it.
+flags are not float32. Minari's layout loses neither. The module to read it is
+:mod:`torchrl_bmrl.data.lerobot_reader`.
 """
 
 from __future__ import annotations

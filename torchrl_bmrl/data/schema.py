@@ -12,16 +12,6 @@ from torchrl_bmrl.data.episodes import Episode, name_fault
 from torchrl_bmrl.data.options import Bounds
 from torchrl_bmrl.errors import ConfigError, DataError
 
-OBSERVATION_SHAPES: dict[str, int] = {
-    "robot0_joint_pos": 7,
-    "robot0_gripper_qpos": 2,
-    "robot0_joint_vel": 7,
-    "robot0_eef_pos": 3,
-    "robot0_eef_quat": 4,
-    "goal_pos": 3,
-}
-"""Parts of the six tasks' observation and their sizes, in the order of the environment."""
-ACTION_DIM = 7
 ACTION_TOLERANCE = 1e-6
 FLOAT32 = float(np.finfo(np.float32).max)
 
