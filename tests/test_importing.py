@@ -24,8 +24,7 @@ from torchrl_bmrl.data.importing import (
     import_demonstrations,
     read_original_bounds,
 )
-from torchrl_bmrl.data.options import ReadOptions
-from torchrl_bmrl.data.sources import join_bounds
+from torchrl_bmrl.data.options import ReadOptions, join_bounds
 from torchrl_bmrl.errors import ConfigError, DataError, UnknownNameError
 
 

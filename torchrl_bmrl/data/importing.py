@@ -14,11 +14,10 @@ import numpy as np
 from torchrl_bmrl.data import robomimic
 from torchrl_bmrl.data.convert import Conversion, Stream, writing
 from torchrl_bmrl.data.episodes import Episode
-from torchrl_bmrl.data.options import Bounds, ReadOptions, check_bounds
+from torchrl_bmrl.data.options import Bounds, ReadOptions, check_bounds, join_bounds
 from torchrl_bmrl.data.robomimic_file import MASKS
 from torchrl_bmrl.data.sources import (
     Source,
-    join_bounds,
     open_sources,
     range_of_actions,
     with_bounds,
@@ -144,7 +143,7 @@ def find_action_bounds(
 
     They are those of ``options.bounds``, else those that the file states, else [-1, 1] if all
     actions lie in that range, else each dimension's smallest and largest action. Several sources
-    have the bounds that contain those of each. :func:`~torchrl_bmrl.data.sources.join_bounds`
+    have the bounds that contain those of each. :func:`~torchrl_bmrl.data.options.join_bounds`
     joins the bounds of several tasks.
 
     Args:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import reduce
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -128,6 +129,30 @@ def check_bounds(bounds: Bounds, name: str = "bounds") -> Bounds:
             "for each dimension in place of either"
         )
     return _plain(low), _plain(high)
+
+
+def join_bounds(bounds: Sequence[Bounds]) -> Bounds:
+    """The narrowest bounds that contain all of the given ones.
+
+    Args:
+        bounds: at least one.
+
+    Raises:
+        ConfigError: if they have different numbers of dimensions.
+
+    Example:
+        >>> join_bounds([(-1.0, 1.0), ((-2.0, 0.0), (0.5, 0.5))])
+        ((-2.0, -1.0), (1.0, 1.0))
+    """
+    arrays: list[list[Any]] = [[np.asarray(end, dtype=float) for end in pair] for pair in bounds]
+    try:
+        low = reduce(np.minimum, [low for low, _ in arrays])
+        high = reduce(np.maximum, [high for _, high in arrays])
+    except ValueError as error:
+        sizes = sorted({end.size for pair in arrays for end in pair if end.ndim})
+        message = f"the actions' bounds have {sizes} dimensions; valid: equally many"
+        raise ConfigError(message) from error
+    return check_bounds((low, high))
 
 
 def _plain(bound: np.ndarray) -> float | tuple[float, ...]:

@@ -6,7 +6,6 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from torchrl_bmrl.data import d4rl, lerobot_reader, minari, robomimic, robosuite
 from torchrl_bmrl.data.account import Account
 from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
 from torchrl_bmrl.data.hdf5 import open_file, read_names
-from torchrl_bmrl.data.options import Bounds, ReadOptions, check_bounds
+from torchrl_bmrl.data.options import Bounds, ReadOptions, check_bounds, join_bounds
 from torchrl_bmrl.data.raw import Opened, RawEpisode, complete, success_fault
 from torchrl_bmrl.errors import ConfigError, DataError
 
@@ -320,30 +319,6 @@ def _open_robosuite(stack: ExitStack, path: Path, task: str | None, tracking: fl
         metadata={"env_args": robosuite_metadata(task), "task": task},
         prefix="data/",
     )
-
-
-def join_bounds(bounds: Sequence[Bounds]) -> Bounds:
-    """The narrowest bounds that contain all of the given ones.
-
-    Args:
-        bounds: at least one.
-
-    Raises:
-        ConfigError: if they have different numbers of dimensions.
-
-    Example:
-        >>> join_bounds([(-1.0, 1.0), ((-2.0, 0.0), (0.5, 0.5))])
-        ((-2.0, -1.0), (1.0, 1.0))
-    """
-    arrays: list[list[Any]] = [[np.asarray(end, dtype=float) for end in pair] for pair in bounds]
-    try:
-        low = reduce(np.minimum, [low for low, _ in arrays])
-        high = reduce(np.maximum, [high for _, high in arrays])
-    except ValueError as error:
-        sizes = sorted({end.size for pair in arrays for end in pair if end.ndim})
-        message = f"the actions' bounds have {sizes} dimensions; valid: equally many"
-        raise ConfigError(message) from error
-    return check_bounds((low, high))
 
 
 def with_bounds(sources: Iterable[Source], bounds: Bounds) -> list[Source]:
