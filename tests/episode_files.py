@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,22 @@ import numpy as np
 
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import write_episodes
-from torchrl_bmrl.data.schema import OBSERVATION_SHAPES, arrays_of
+from torchrl_bmrl.data.schema import arrays_of
 
 Parts = Mapping[str, tuple[tuple[int, ...], Any]]
 """Shape of a row and dtype of each part of an observation."""
 
 PARTS: Parts = {"object": ((10,), np.float64), "image": ((8, 8, 3), np.uint8)}
 """Not the six tasks': any robot's observations will do."""
+OBSERVATION_SHAPES: dict[str, int] = {
+    "robot0_joint_pos": 7,
+    "robot0_gripper_qpos": 2,
+    "robot0_joint_vel": 7,
+    "robot0_eef_pos": 3,
+    "robot0_eef_quat": 4,
+    "goal_pos": 3,
+}
+"""Parts of the six tasks' observation and their sizes, in the order of the environment."""
 TASK_PARTS: Parts = {name: ((size,), np.float64) for name, size in OBSERVATION_SHAPES.items()}
 LENGTHS = (5, 6, 7, 8)
 ENV_ARGS = {"env_name": "BMRLSawyerLift", "type": 1, "env_version": "1", "env_kwargs": {"a": 1}}
@@ -88,6 +98,25 @@ def write_file(
         masks={"train": range(train), "valid": range(train, len(lengths))},
     )
     return episodes
+
+
+def readers(open_data: Any) -> tuple[Any, Any, Any]:
+    """Functions that return the episodes, the metadata and the oddities of a data set alone."""
+
+    @contextmanager
+    def open_raw(path: Path, **options: Any) -> Iterator[Mapping[str, Any]]:
+        with open_data(path, **options) as opened:
+            yield opened.episodes
+
+    def read_metadata(path: Path, **options: Any) -> dict[str, Any]:
+        with open_data(path, **options) as opened:
+            return opened.metadata
+
+    def find_oddities(path: Path, **options: Any) -> list[str]:
+        with open_data(path, **options) as opened:
+            return list(opened.oddities)
+
+    return open_raw, read_metadata, find_oddities
 
 
 def assert_same(read: Episode, made: Episode) -> None:

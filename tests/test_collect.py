@@ -14,10 +14,10 @@ pytest.importorskip("robosuite", exc_type=ImportError)
 pytest.importorskip("h5py")
 
 import h5py
+from episode_files import OBSERVATION_SHAPES
 
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import open_episodes, read_kept_episode
-from torchrl_bmrl.data.schema import OBSERVATION_SHAPES
 from torchrl_bmrl.envs.skills import SKILLS
 from torchrl_bmrl.errors import ConfigError, DataError, UnknownNameError
 from torchrl_bmrl.experts import collect

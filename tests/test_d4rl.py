@@ -13,12 +13,15 @@ from numpy.testing import assert_array_equal
 pytest.importorskip("h5py")
 
 import h5py
+from episode_files import readers
 
 from torchrl_bmrl.data import d4rl_layout
-from torchrl_bmrl.data.d4rl import find_oddities, is_d4rl, open_raw, read_metadata
+from torchrl_bmrl.data.d4rl import is_d4rl, open_data
 from torchrl_bmrl.data.options import ReadOptions
 from torchrl_bmrl.data.raw import RawEpisode, complete
 from torchrl_bmrl.errors import ConfigError, DataError
+
+open_raw, read_metadata, find_oddities = readers(open_data)
 
 # One episode terminates, two are cut by a horizon of 6, the last is not finished.
 LENGTHS = {"terminal": 4, "timeout": 6, "again": 6, "rest": 3}
@@ -192,16 +195,14 @@ def test_metadata_is_told_and_large_arrays_are_named(path: Path) -> None:
         file.attrs["author"] = "someone"
         file["metadata"].attrs["env"] = "hopper-medium-v2"
     assert read_metadata(path) == {
-        "attributes": {"author": "someone"},
-        "metadata": {
-            "env": "hopper-medium-v2",
-            "algorithm": "SAC",
-            "iteration": 100,
-            "policy/nonlinearity": "relu",
-        },
+        "author": "someone",
+        "env": "hopper-medium-v2",
+        "algorithm": "SAC",
+        "iteration": 100,
+        "policy/nonlinearity": "relu",
     }
     assert find_oddities(path)[-1] == (
-        "2 arrays below metadata are left alone, such as metadata/policy/fc0/bias"
+        "2 arrays below metadata are not read, such as metadata/policy/fc0/bias"
     )
 
 
@@ -213,7 +214,7 @@ def test_a_circle_of_groups_ends(path: Path) -> None:
     raw = read(path)["rows_0_to_3"]
     assert "a" in raw.extras
     assert any(key.startswith("infos/self/self") for key in raw.left_alone)
-    assert read_metadata(path)["metadata"]["b"] == 1
+    assert read_metadata(path)["b"] == 1
 
 
 def test_no_more_than_an_episode_is_read_at_once(
@@ -263,8 +264,8 @@ def test_jumps_are_found_in_blocks_of_any_size(
 def test_ends_that_nothing_tells_are_refused_with_the_ways_out(path: Path) -> None:
     write(path, make_arrays(), timeouts=None, next_observations=None)
     message = (
-        "timeouts: missing, and next_observations as well: where episodes were cut cannot be "
-        r"known; valid: timeouts \(N,\), or a horizon, the longest episode's steps"
+        "timeouts: missing, and so is next_observations: it is unknown where episodes were cut; "
+        r"valid: timeouts \(N,\), or a horizon, the longest episode's steps"
     )
     with pytest.raises(DataError, match=message):
         read(path)
@@ -393,7 +394,7 @@ REFUSED: dict[str, tuple[Callable[[dict[str, Any]], dict[str, Any]], str]] = {
     "no terminals": (lambda a: {"terminals": None}, "terminals: missing"),
     "a row less": (
         lambda a: {"actions": a["actions"][:-1]},
-        r"actions: shape \(18, 2\); valid: 19 rows, as most arrays have",
+        r"actions: shape \(18, 2\); valid: 19 rows, since most arrays have 19 steps",
     ),
     "a row more": (
         lambda a: {"timeouts": np.append(a["timeouts"], True)},
@@ -402,7 +403,7 @@ REFUSED: dict[str, tuple[Callable[[dict[str, Any]], dict[str, Any]], str]] = {
     "a number": (lambda a: {"rewards": 1.0}, "rewards: one number; valid: a row for each step"),
     "wide rewards": (
         lambda a: {"rewards": np.zeros((N, 2))},
-        r"rewards: rows of shape \(2,\); valid: of one number",
+        r"rewards: rows of shape \(2,\); valid: one number in each",
     ),
     "other next observations": (
         lambda a: {"next_observations": a["next_observations"][:, :2]},
@@ -439,7 +440,7 @@ REFUSED: dict[str, tuple[Callable[[dict[str, Any]], dict[str, Any]], str]] = {
     ),
     "no part": (
         lambda a: {"observations": None, "observations/x": [b"a"] * N},
-        "observations: no part of an observation; valid: at least one",
+        "observations: no part of the observation; valid: at least one",
     ),
     "a part without a next one": (
         lambda a: {

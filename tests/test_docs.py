@@ -192,6 +192,7 @@ def test_commands_for_data_do_what_the_page_says(
     episodes = [make_episode(seed, parts=TASK_PARTS) for seed in range(2)]
     args = {"env_name": "BMRLSawyerLift", "type": 1, "env_kwargs": {"control_freq": 20}}
     write_episodes(ours, episodes, env_args=args, masks={"train": [0], "valid": [1]})
+    write_episodes(tmp_path / "own.hdf5", episodes, env_args=args)
     record(tmp_path / "demo.hdf5", "lift", 30)
     arguments = [
         parts(line)[3:]

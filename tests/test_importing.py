@@ -24,8 +24,7 @@ from torchrl_bmrl.data.importing import (
     import_demonstrations,
     read_original_bounds,
 )
-from torchrl_bmrl.data.options import ReadOptions
-from torchrl_bmrl.data.sources import join_bounds
+from torchrl_bmrl.data.options import ReadOptions, join_bounds
 from torchrl_bmrl.errors import ConfigError, DataError, UnknownNameError
 
 
@@ -93,7 +92,7 @@ def test_d4rl_is_scaled_by_its_range_and_keeps_terminations(tmp_path: Path) -> N
 
 def test_minari_is_scaled_by_the_bounds_of_its_space(tmp_path: Path) -> None:
     pytest.importorskip("minari")
-    low, high = (-0.5,) * 7, (2.0,) * 6 + (1.0,)
+    low, high = -0.5, (2.0,) * 6 + (1.0,)
     made = [make_episode(i) for i in range(3)]
     minari.write_episodes(
         tmp_path / "own" / "lift-v0", [in_units(x, low, high) for x in made], bounds=(low, high)

@@ -198,7 +198,7 @@ def test_a_file_of_each_layout_goes_to_each_format_and_back_or_the_loss_is_named
     if to == "lerobot":
         assert "observation after the last step" in notes
     if layout == "Isaac Lab":
-        assert "left alone in the episodes: initial_state (3x), states (3x)" in notes
+        assert "not read in the episodes: initial_state (3x), states (3x)" in notes
     if layout == "LIBERO" and to == "lerobot":
         assert "robot_states" in notes
         assert "terminations" not in notes  # they come back

@@ -53,9 +53,7 @@ def make_episodes() -> list[Episode]:
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    write_episodes(
-        tmp_path / "lift", iter(make_episodes()), fps=FPS, task=TASK, robot_type="sawyer"
-    )
+    write_episodes(tmp_path / "lift", iter(make_episodes()), fps=FPS, task=TASK)
     return tmp_path / "lift"
 
 
@@ -112,7 +110,7 @@ def test_the_features_describe_the_columns(path: Path) -> None:
     names = [f"goal_pos.{i}" for i in range(3)] + ["opening"] + [f"joints.{i}" for i in range(7)]
     assert info["features"]["observation.state"]["names"] == names
     assert info["features"]["action"]["names"] == [f"action.{i}" for i in range(7)]
-    assert (info["codebase_version"], info["fps"], info["robot_type"]) == ("v3.0", FPS, "sawyer")
+    assert (info["codebase_version"], info["fps"], info["robot_type"]) == ("v3.0", FPS, None)
     assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (4, 17, 1)
     assert info["splits"] == {"train": "0:4"}
 

@@ -16,15 +16,16 @@ pytest.importorskip("tqdm")
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from episode_files import make_episode
+from episode_files import make_episode, readers
 
 from torchrl_bmrl.data import lerobot
 from torchrl_bmrl.data.account import Account
 from torchrl_bmrl.data.convert import open_source
-from torchrl_bmrl.data.lerobot_reader import find_oddities, open_raw, read_metadata
+from torchrl_bmrl.data.lerobot_reader import open_data
 from torchrl_bmrl.data.schema import find_problems
 from torchrl_bmrl.errors import DataError
 
+open_raw, read_metadata, find_oddities = readers(open_data)
 LENGTHS, FPS = (4, 6, 5), 10
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 Columns = dict[str, Any]
@@ -124,11 +125,11 @@ def test_what_a_set_says_of_itself_is_read_and_contradictions_are_named(
 ) -> None:
     path = write(tmp_path / "set", version)
     assert read_metadata(path) == {"dataset_id": "set", "fps": FPS}  # of several tasks: no task
-    pictures = "left alone, as pictures: observation.images.top, observation.images.wrist"
+    pictures = "pictures are not read: observation.images.top, observation.images.wrist"
     assert find_oddities(path) == [pictures]
     info = json.loads((path / "meta/info.json").read_text())
     (path / "meta/info.json").write_text(json.dumps(info | {"total_frames": 16}))
-    assert "total_frames says 16, there are 15" in find_oddities(path)[0]
+    assert "total_frames is 16, but there are 15" in find_oddities(path)[0]
 
 
 def test_what_was_written_here_comes_back_in_its_parts(tmp_path: Path) -> None:
@@ -213,9 +214,12 @@ FAULTS: dict[str, tuple[Callable[[Columns], object], str]] = {
     ),
     "pairs of rewards": (
         lambda c: c.update({"next.reward": [[0.0, 1.0]] * 6}),
-        r"next\.reward: \(2,\) numbers in row \d+; valid: one",
+        r"next\.reward: rows of shape \(2,\); valid: one number in each",
     ),
-    "uneven time": (set_row("timestamp", 3, 0.9), r"timestamp: .* does not fit 10 steps a second"),
+    "uneven time": (
+        set_row("timestamp", 3, 0.9),
+        r"timestamp: .* does not match 10 steps a second",
+    ),
 }
 
 

@@ -6,6 +6,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,27 +20,30 @@ pytest.importorskip("minari")
 import gymnasium.spaces as gym
 import h5py
 import minari
+from episode_files import readers
 from minari.data_collector import EpisodeBuffer
 from tensordict import TensorDict
 from torchrl.data.datasets.minari_data import MinariExperienceReplay
 
-from torchrl_bmrl.data.episodes import Episode, as_tensordict, stack_episodes
-from torchrl_bmrl.data.minari import (
-    find_oddities,
-    join_observations,
-    new_folder,
-    open_episodes,
-    open_raw,
-    read_metadata,
-    write_episodes,
-)
+from torchrl_bmrl.data.episodes import Episode, LazyEpisodes, as_tensordict, stack_episodes
+from torchrl_bmrl.data.minari import join_observations, new_folder, open_data, write_episodes
+from torchrl_bmrl.data.options import ReadOptions
+from torchrl_bmrl.data.raw import complete
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
 
+open_raw, read_metadata, find_oddities = readers(open_data)
 ID = "sawyer/lift-v0"
 Damage = Callable[[Path], None]
 
 # Minari recommends to name an author, an environment, ...
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:minari")
+
+
+@contextmanager
+def open_episodes(path: Path) -> Iterator[dict[str, Episode]]:
+    file = path / "data" / "main_data.hdf5"
+    with open_raw(path) as raws:
+        yield LazyEpisodes(raws, lambda name: complete(file, name, raws[name], ReadOptions()))
 
 
 def make_episode(seed: int = 0, steps: int = 5, *, terminates: bool = False) -> Episode:
@@ -519,7 +523,7 @@ def test_bounds_that_do_not_fit_are_refused(root: Path) -> None:
         write_episodes(root / ID, make_episodes(), bounds=(-0.1, 0.1))
     with pytest.raises(ConfigError, match=r"bounds is .*; valid: two finite numbers"):
         write_episodes(root / ID, make_episodes(), bounds=(1, -1))
-    with pytest.raises(DataError, match=r"episode_0/actions: shape \(5, 7\), and bounds of 2"):
+    with pytest.raises(DataError, match=r"episode_0/actions: shape \(5, 7\), but bounds of 2"):
         write_episodes(root / ID, make_episodes(), bounds=([-1, -1], 1))
     assert list((root / "sawyer").iterdir()) == []
 
@@ -680,9 +684,9 @@ def truncate(path: Path) -> None:
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n"
 DAMAGES: dict[str, tuple[Damage, str]] = {
     "no numbers": (overwrite("main_data.hdf5", None), "main_data.hdf5: no such file"),
-    "no metadata": (overwrite("metadata.json", None), "metadata.json: unreadable .No such file"),
-    "empty file": (overwrite("main_data.hdf5", b""), "main_data.hdf5: not a whole HDF5 file"),
-    "truncated file": (truncate, "main_data.hdf5: not a whole HDF5 file"),
+    "no metadata": (overwrite("metadata.json", None), "metadata.json: no such file"),
+    "empty file": (overwrite("main_data.hdf5", b""), "main_data.hdf5: not a complete HDF5 file"),
+    "truncated file": (truncate, "main_data.hdf5: not a complete HDF5 file"),
     "pointer": (overwrite("main_data.hdf5", POINTER), "main_data.hdf5: a git-LFS pointer"),
     "pointer of metadata": (overwrite("metadata.json", POINTER), "metadata.json: a git-LFS"),
     "half metadata": (overwrite("metadata.json", b'{"total'), "metadata.json: not Minari's"),
@@ -711,7 +715,7 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
     ),
     "no action": (
         replace("episode_1/actions", np.zeros((0, 7))),
-        r"episode_1/actions: shape \(0, 7\); valid: 7 rows, since most arrays are of 7",
+        r"episode_1/actions: shape \(0, 7\); valid: 7 rows, since most arrays have 7 steps",
     ),
     "a number": (replace("episode_1/actions", 3.0), "actions: one number; valid: a row for each"),
     "half an action more": (
@@ -827,7 +831,7 @@ def test_what_is_not_read_is_named(path: Path) -> None:
     with open_episodes(path) as episodes:
         assert episodes["episode_1"].left_out.arrays[0] == "camera"
         assert_same_episodes(episodes["episode_1"], make_episodes()[1])
-    assert find_oddities(path) == ["beside the episodes, left alone: 'episode_01', 'notes'"]
+    assert find_oddities(path) == ["beside the episodes, not read: 'episode_01', 'notes'"]
 
 
 def test_parts_that_are_no_arrays_are_left_alone_where_others_are(root: Path) -> None:
@@ -905,7 +909,7 @@ def test_an_info_that_minari_made_jpeg_of_is_left_alone(root: Path) -> None:
         left_alone = ("infos/mask",) if COMPRESSES_ALL else ()
         assert episodes["episode_0"].left_alone == left_alone
     assert [line.partition(" in")[0] for line in find_oddities(root / ID)] == [
-        f"{key}: stored as JPEG, and left alone" for key in left_alone
+        f"{key}: stored as JPEG, and not read" for key in left_alone
     ]
 
 

@@ -222,7 +222,7 @@ def printed(path: Path, options: dict[str, Any]) -> tuple[bool, dict[str, np.nda
 
 @pytest.mark.filterwarnings("ignore:.*last steps with a reward:UserWarning")
 @pytest.mark.filterwarnings("ignore:.*left out on request:UserWarning")
-@pytest.mark.filterwarnings("ignore:.*left alone in the episodes:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*not read in the episodes:UserWarning")
 def test_every_step_reward_and_success_of_an_odd_file_is_accounted_for_or_it_is_refused(
     tmp_path: Path,
 ) -> None:

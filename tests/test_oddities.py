@@ -249,8 +249,7 @@ def test_a_success_that_contradicts_the_successes_is_found(kind: Callable[[Any],
     found = summarise({f"demo_{i}": episode for i, episode in enumerate(episodes)}).warnings
     (warning,) = (text for text in found if "attribute success contradicts" in text)
     assert warning == (
-        "attribute success contradicts successes in 1 episodes, such as demo_1; "
-        "successes are believed"
+        "attribute success contradicts successes in 1 episodes, such as demo_1; successes are used"
     )
 
 

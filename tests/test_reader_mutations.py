@@ -228,7 +228,7 @@ MINARI: dict[str, tuple[Edit, str | None]] = {
         lambda file, rng: file.copy(f"episode_{rng.integers(4)}", "episode_4"),
         "total_episodes is 4 in metadata.json, the arrays have 5",
     ),
-    "beside the episodes": (add_beside(""), "beside the episodes, left alone: 'spare_"),
+    "beside the episodes": (add_beside(""), "beside the episodes, not read: 'spare_"),
     "beside the arrays": (add_beside("episode_{}", "episode_{}/infos"), "spare_"),
     "beside the parts": (add_beside("episode_{}/observations"), "observations/spare_"),
     "an id": (change_attribute("id", 9, -1, "x", 2.5, [1, 2]), "id contradicts"),
@@ -388,7 +388,7 @@ D4RL: dict[str, tuple[Edit, str | None]] = {
     "beside": (add_beside("", "infos"), "spare_"),
     "beside the metadata": (
         lambda file, rng: file.update({"metadata/net/weight": np.zeros((2, 2))}),
-        "1 arrays below metadata are left alone, such as metadata/net/weight",
+        "1 arrays below metadata are not read, such as metadata/net/weight",
     ),
 }
 
@@ -524,13 +524,12 @@ class Mutator:
 
     def read(self) -> tuple[dict[str, RawEpisode], list[str]]:
         module, source = self.layout.module, self.layout.source
-        with module.open_raw(source) as episodes:
-            raws = dict(episodes)
+        with module.open_data(source) as opened:
+            raws = dict(opened.episodes)
         for name, raw in raws.items():
             if raw.rewards is None:
                 complete(self.layout.file, name, raw, ReadOptions())
-        module.read_metadata(source)
-        return raws, module.find_oddities(source)
+        return raws, list(opened.oddities)
 
     def bytes(self, kind: str, seed: int) -> Outcome:
         """A mutation of bytes: whatever loads is the original."""

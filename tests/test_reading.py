@@ -94,7 +94,7 @@ def test_a_file_that_would_lose_all_of_its_reward_is_refused_by_every_command(
     assert "in the file       4 episodes, 80 steps, reward 4, 0 successes" in out
     assert "read              4 episodes, 76 steps, reward 0, 0 successes" in out
     assert "left out          4 steps, reward 4, 0 successes" in out
-    says = "all of the reward (4) is at last steps, and lost"
+    says = "all of the reward (4) is in last steps and would be lost"
     assert f"{path}: rewards: {says}" in err
     with pytest.raises(DataError, match="last_step 'truncate' or 'terminate'"):
         load(path)
@@ -154,7 +154,7 @@ def test_successes_that_are_all_at_last_steps_are_not_lost_in_silence(tmp_path: 
     last = np.arange(STEPS) == STEPS - 1
     dense = put("rewards", np.full(STEPS, 0.5))
     path = write(tmp_path / "a.hdf5", dense, put("successes", last))
-    with pytest.raises(DataError, match=r"successes: all successes \(4\) are at last steps"):
+    with pytest.raises(DataError, match=r"successes: all successes \(4\) are in last steps"):
         load(path)
     assert load(path, last_step="truncate")[:]["next", "success"].sum() == EPISODES
 
@@ -241,7 +241,7 @@ def test_isaac_labs_files_get_their_reward_from_the_attribute_success(
     for name in ("states", "initial_state", "obs/datagen_info"):
         assert f"{name} (4x)" in out
     assert main(["convert", str(path), str(tmp_path / "b.hdf5"), "--to", "robomimic", *flags]) == 0
-    assert "left alone in the episodes: obs/datagen_info (4x)" in capsys.readouterr().out
+    assert "not read in the episodes: obs/datagen_info (4x)" in capsys.readouterr().out
 
 
 def test_failures_are_left_out_on_request_and_counted(tmp_path: Path, capsys: Any) -> None:
@@ -256,7 +256,7 @@ def test_failures_are_left_out_on_request_and_counted(tmp_path: Path, capsys: An
     assert "left out          1 episodes, 20 steps, reward 1, 0 successes" in out
     done = convert(path, tmp_path / "b.hdf5", to="robomimic", successful=True)
     assert (done.account.read.steps, done.account.failed.steps) == (60, 20)
-    assert any("renamed: 2 episodes; demo_2 is demo_1 now" in note for note in done.notes)
+    assert any("renamed: 2 episodes, such as demo_2 to demo_1" in note for note in done.notes)
 
 
 def test_successes_decide_before_the_attribute(tmp_path: Path) -> None:
@@ -272,10 +272,10 @@ def test_successes_decide_before_the_attribute(tmp_path: Path) -> None:
 def test_success_that_nobody_tells_cannot_be_chosen_by(tmp_path: Path) -> None:
     path = write(tmp_path / "a.hdf5", next_obs=True)
     for option in ({"successful": True}, {"reward": "success"}):
-        with pytest.raises(DataError, match="data/demo_0: neither an attribute success nor succ"):
+        with pytest.raises(DataError, match="data/demo_0: no attribute success and no succ"):
             load(path, **option)
     path = write(tmp_path / "b.hdf5", tell("success", False), next_obs=True)
-    with pytest.raises(DataError, match="no episode succeeded of 4"):
+    with pytest.raises(DataError, match="none of 4 episodes succeeded"):
         load(path, successful=True)
 
 
@@ -301,7 +301,7 @@ def test_what_other_tools_keep_stops_nothing_and_is_named(tmp_path: Path, capsys
     assert data.exclude("next").keys() == {"x", "action", "episode", "step"}
     code, out, err = checked(path, capsys)
     assert (code, err) == (0, "")
-    assert "beside the demonstrations: data/config, data/index, extra" in out
+    assert "beside the demonstrations, not read: data/config, data/index, extra" in out
     for name in ("obs/datagen_info", "obs/language", "states", "note", "next_obs/more"):
         assert f"{name} (4x)" in out, name
 
@@ -325,7 +325,7 @@ def test_attributes_that_contradict_the_arrays_are_said_and_not_believed(
     code, out, _ = checked(path, capsys)
     assert code == 0
     assert "num_samples contradicts the arrays in 4 episodes, such as demo_0 says 19 of 20" in out
-    assert "total says 3 steps, the arrays have 80" in out
+    assert "total is 3 steps, but the arrays have 80" in out
     assert len(load(path)) == EPISODES * STEPS
     notes = convert(path, tmp_path / "b.hdf5", to="robomimic").notes
     assert any("num_samples" in note for note in notes)
@@ -356,7 +356,7 @@ def test_actions_beyond_1_go_in_with_their_bounds_through_every_command(
     path = write(tmp_path / "a.hdf5", put("actions", actions), next_obs=True)
     code, out, err = checked(path, capsys)
     assert code == 1
-    assert "outside [-1.0, 1.0]; the option bounds takes others" in err
+    assert "outside [-1.0, 1.0]; the option bounds sets others" in err
     (line,) = (line for line in out.splitlines() if line.split()[:1] == ["actions"])
     assert line.split()[-2:] == [f"{actions.min():.4g}", f"{actions.max():.4g}"]
     assert checked(path, capsys, "--bounds", "-2", "2")[0] == 0
@@ -382,7 +382,7 @@ def test_the_range_of_the_data_can_be_their_bounds(tmp_path: Path) -> None:
 
 def test_bounds_of_another_size_are_named(tmp_path: Path) -> None:
     path = write(tmp_path / "a.hdf5", next_obs=True)
-    with pytest.raises(DataError, match=r"actions: shape \(20, 7\), and bounds of 2 dimensions"):
+    with pytest.raises(DataError, match=r"actions: shape \(20, 7\), but bounds of 2 dimensions"):
         load(path, bounds=([-1, -1], [1, 1]))
     assert len(load(path, bounds=([-1] * 7, 1))) == EPISODES * STEPS
 
@@ -427,7 +427,7 @@ def test_files_become_one_without_losing_an_episode(tmp_path: Path, capsys: Any)
     assert main(["convert", *map(str, paths), str(target), "--to", "robomimic"]) == 0
     told = capsys.readouterr().out
     assert f"{target}: robomimic, 12 episodes, 240 steps, reward 12, 0 successes" in told
-    assert "left out, as the data set has no place for it: author" in told
+    assert "left out, because the format has no place for it: author" in told
     data = load(target)[:]
     assert data["episode"].unique().tolist() == list(range(12))
     masks = read_metadata(target)["masks"]
@@ -439,7 +439,7 @@ def test_files_of_other_bounds_do_not_become_one(tmp_path: Path) -> None:
     two = write(tmp_path / "b.hdf5", next_obs=True)
     with h5py.File(two, "a") as file:
         file["data"].attrs["action_bounds"] = json.dumps({"low": -2, "high": 2})
-    with pytest.raises(ConfigError, match=r"b\.hdf5 are bounded by .*; valid: equal bounds"):
+    with pytest.raises(ConfigError, match=r"b\.hdf5 have bounds .*; valid: equal bounds"):
         convert([one, two], tmp_path / "c.hdf5", to="robomimic")
 
 
@@ -540,7 +540,7 @@ def test_the_attribute_success_means_the_same_to_every_command(
 
 def test_an_attribute_success_that_says_nothing_is_named_with_its_value(tmp_path: Path) -> None:
     path = write(tmp_path / "a.hdf5", tell("success", 2), next_obs=True)
-    with pytest.raises(DataError, match="attribute success is 2, neither 0 nor 1"):
+    with pytest.raises(DataError, match="attribute success is 2 instead of 0 or 1"):
         load(path, successful=True)
     assert load(path).metadata["account"]["read"]["successes"] == 0
 
@@ -551,7 +551,7 @@ def test_an_attribute_success_that_contradicts_successes_is_said(
     edits = tell("success", True), put("successes", np.zeros(STEPS, bool))
     path = write(tmp_path / "a.hdf5", *edits, next_obs=True)
     says = "attribute success contradicts successes in 4 episodes, such as demo_0; "
-    says += "successes are believed"
+    says += "successes are used"
     assert says in checked(path, capsys)[1]
     assert says in load(path).metadata["warnings"]
 
@@ -581,7 +581,7 @@ def test_a_data_set_that_is_named_nearly_like_a_demonstration_is_left_alone(
         file[f"data/{name}"] = np.zeros(4)
     code, out, _ = checked(path, capsys)
     assert code == 0
-    assert f"left alone, beside the demonstrations: data/{name}" in out
+    assert f"beside the demonstrations, not read: data/{name}" in out
 
 
 @pytest.mark.parametrize("value", ["20", 20.0, np.array([20])])
@@ -618,7 +618,7 @@ def test_parts_of_the_observation_are_chosen_from_every_format(
         assert list(file["data/demo_0/obs"]) == ["y"]
     code, _, err = checked(source, capsys, "--observation-keys", "z", "--last-step", "drop")
     assert code == 1
-    assert "episode_0/z: no part of the observation; valid: x, y" in err
+    assert "episode_0/z: not a part of the observation; valid: x, y" in err
 
 
 # -- bounds and several files, as strangers write them ---------------------------------------------
@@ -671,7 +671,7 @@ def test_a_mask_that_some_of_the_files_lack_is_said(tmp_path: Path) -> None:
     with h5py.File(one, "r+") as file:
         file["mask/train"] = [b"demo_0"]
     done = convert([one, other], tmp_path / "c.hdf5", to="robomimic")
-    assert any(f"mask train has no episode of {other}" in note for note in done.notes)
+    assert any(f"mask train has no episodes of {other}" in note for note in done.notes)
 
 
 def test_an_iterator_of_keys_serves_all_files(tmp_path: Path) -> None:

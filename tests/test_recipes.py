@@ -688,7 +688,7 @@ def test_damaged_demonstrations_stop_training_before_anything_is_written(
         run(tmp_path, train_bcq.train_all, "tasks=[lift]")
     assert caught.value.code == 1
     message = capsys.readouterr().err.splitlines()[-1]
-    says = "not a whole HDF5 file" if damage == "truncated" else "not finite in row 2"
+    says = "not a complete HDF5 file" if damage == "truncated" else "not finite in row 2"
     assert message.startswith(f"error: {path}: ")
     assert says in message
     assert not (tmp_path / "bcq").exists()

@@ -30,8 +30,6 @@ from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import (
     count_episodes,
     count_steps,
-    find_mask_problems,
-    find_oddities,
     keep_episode,
     open_episodes,
     read_kept_episode,
@@ -39,6 +37,7 @@ from torchrl_bmrl.data.robomimic import (
     write_episodes,
 )
 from torchrl_bmrl.data.schema import find_problems
+from torchrl_bmrl.data.sources import Source, open_source
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
 
 Damage = Callable[[Any], None]
@@ -55,6 +54,11 @@ def path(tmp_path: Path) -> Path:
 def read(path: Path, **options: Any) -> dict[str, Episode]:
     with open_episodes(path, **options) as episodes:
         return dict(episodes)
+
+
+def opened(path: Path) -> Source:
+    with open_source(path) as source:
+        return source
 
 
 def put(key: str, value: Any) -> Damage:
@@ -247,7 +251,7 @@ def test_without_next_observations_the_last_step_is_lost(tmp_path: Path) -> None
         assert_identical(episode.extras["states"], original.extras["states"][:-1])
         assert episode.terminated.tolist() == [False] * len(episode)
     assert count_steps(path, read(path)) == sum(LENGTHS) - 4
-    (told,) = find_oddities(path)
+    (told,) = opened(path).oddities
     assert "4 episodes have no next_obs, such as demo_0" in told
 
 
@@ -276,13 +280,13 @@ def test_steps_are_counted_over_the_episodes_named(path: Path) -> None:
 
 
 def test_every_faulty_mask_is_told(path: Path) -> None:
-    assert find_mask_problems(path) == find_oddities(path) == []
+    assert opened(path).problems == opened(path).oddities == []
     edit(
         path,
         put("mask/train", np.array([b"demo_0", b"demo_7"])),
         put("mask/valid", np.array([b"demo_1", b"demo_1"])),
     )
-    assert find_mask_problems(path) == [
+    assert opened(path).problems == [
         ("mask/train", "row 1 names 'demo_7', which is not in the file"),
         ("mask/valid", "row 1 names 'demo_1', again"),
     ]
@@ -290,7 +294,7 @@ def test_every_faulty_mask_is_told(path: Path) -> None:
 
 def test_an_episode_to_train_on_and_to_hold_out_deserves_a_look(path: Path) -> None:
     edit(path, put("mask/valid", np.array([b"demo_3", b"demo_1"])))
-    assert find_oddities(path) == ["1 episodes are in train and in valid, such as demo_1"]
+    assert opened(path).oddities == ["1 episodes are in train and in valid, such as demo_1"]
 
 
 def test_what_could_not_be_trained_on_is_not_written(tmp_path: Path) -> None:
@@ -499,7 +503,7 @@ def test_a_folder_is_not_a_file(tmp_path: Path) -> None:
 def test_another_format_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "lift.hdf5"
     path.write_bytes(content)
-    assert "not a whole HDF5 file" in str(refusal(path))
+    assert "not a complete HDF5 file" in str(refusal(path))
 
 
 def test_a_pointer_to_git_lfs_says_how_to_get_the_data(tmp_path: Path) -> None:
@@ -512,9 +516,9 @@ def test_a_pointer_to_git_lfs_says_how_to_get_the_data(tmp_path: Path) -> None:
 def test_a_truncated_file_is_refused(path: Path, share: float) -> None:
     whole = path.read_bytes()
     path.write_bytes(whole[: int(share * len(whole))])
-    assert "not a whole HDF5 file" in str(refusal(path))
+    assert "not a complete HDF5 file" in str(refusal(path))
     for reader in READERS:
-        with pytest.raises(DataError, match="not a whole HDF5 file"):
+        with pytest.raises(DataError, match="not a complete HDF5 file"):
             reader(path)
 
 

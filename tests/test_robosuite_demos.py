@@ -417,7 +417,7 @@ BAD_STATES = {
         "in row 9; valid: forward",
     ),
     "a gap": (lambda states: np.delete(states, range(20, 40), axis=0), "in row 20; valid"),
-    "no quaternion": (set_value((4, 13), 3.0), "no unit quaternion in row 4"),
+    "no quaternion": (set_value((4, 13), 3.0), "not a unit quaternion in row 4"),
 }
 
 
@@ -485,7 +485,7 @@ def test_a_missing_model_attribute_is_refused(copy: Path) -> None:
     ("content", "message"),
     [
         (None, "no such file"),
-        (b"", "not a whole HDF5 file"),
+        (b"", "not a complete HDF5 file"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "git-LFS"),
     ],
 )

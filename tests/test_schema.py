@@ -64,7 +64,7 @@ def test_an_episode_has_at_least_one_step() -> None:
 
 def test_an_episode_has_at_least_one_part_to_observe() -> None:
     episode = replace(make_episode(), observations={}, next_observations={})
-    assert problems(episode) == {"obs": "no part of an observation; valid: at least one"}
+    assert problems(episode) == {"obs": "no part of the observation; valid: at least one"}
 
 
 @pytest.mark.parametrize("rows", [0, STEPS - 1, STEPS + 1])

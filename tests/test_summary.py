@@ -217,7 +217,7 @@ def test_discrete_actions_do_not_saturate() -> None:
 
 def test_the_same_episode_twice_deserves_a_look() -> None:
     episodes = [*varied(), make_episode(1, STEPS + 1)]
-    assert warnings_of(episodes) == ["the same episode 2 times: demo_1, demo_3"]
+    assert warnings_of(episodes) == ["the same episode occurs 2 times: demo_1, demo_3"]
     # Equal actions alone are no repetition, nor equal observations.
     for key in ("actions", "observations"):
         other = replace(episodes[0], **{key: getattr(make_episode(9), key)})
@@ -244,7 +244,7 @@ def test_actions_beyond_1_deserve_a_look_where_no_bounds_are_told(value: float) 
     actions = episodes[1].actions.copy()
     actions[2, 3] = value
     episodes[1] = replace(episodes[1], actions=actions)
-    expected = "actions: outside [-1, 1]; tell the loss its bounds"
+    expected = "actions: outside [-1, 1]; give the loss their bounds"
     assert warnings_of(episodes, bounds=None) == [expected]
     assert warnings_of(episodes, bounds=(-2, 2)) == []
 

@@ -1,4 +1,4 @@
-"""Writing files so that nobody ever sees half of one."""
+"""Writes files and folders atomically, and reads JSON and CSV files with typed errors."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def atomic_path(path: str | os.PathLike[str], *, replace: bool = True) -> Iterat
     """Yields a temporary path that becomes ``path`` when the block succeeds.
 
     The temporary file lies in the same folder (created if missing), so that the final rename is
-    atomic; its name starts with a dot and ends in ``.tmp``, so that no pattern for finished files
-    (``*.hdf5``) matches what a killed process may leave. If the block raises, the temporary file is
-    removed and whatever was at ``path`` stays.
+    atomic. Its name starts with a dot and ends in ``.tmp``, so that patterns for finished files
+    (``*.hdf5``) do not match what a killed process may leave. If the block raises, the temporary
+    file is removed and an existing ``path`` stays.
 
     Args:
         path: The file to write or replace.
-        replace: ``False`` keeps a file that is there by then, another process's.
+        replace: ``False`` to keep a file that another process has written meanwhile.
 
     Yields:
         Path to write to; the block must create the file and close it.
@@ -46,9 +46,7 @@ def atomic_path(path: str | os.PathLike[str], *, replace: bool = True) -> Iterat
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
         yield temporary
-        with temporary.open("r+b") as file:
-            # Without it a power cut after the rename may leave an empty file under the final name.
-            os.fsync(file.fileno())
+        _sync(temporary)
         if replace or not _link(temporary, path):
             os.replace(temporary, path)
     except BaseException:  # an interrupt must not leave the temporary file either
@@ -56,8 +54,14 @@ def atomic_path(path: str | os.PathLike[str], *, replace: bool = True) -> Iterat
         raise
 
 
+def _sync(path: Path) -> None:
+    """Flushes a file: otherwise a power cut after its rename may leave it empty."""
+    with path.open("r+b") as file:
+        os.fsync(file.fileno())
+
+
 def _link(temporary: Path, path: Path) -> bool:
-    """Gives a file a second name unless that is taken; ``False`` where there are no links."""
+    """Gives a file a second name unless it exists; ``False`` if links are not supported."""
     try:
         os.link(temporary, path)
     except FileExistsError:
@@ -69,40 +73,25 @@ def _link(temporary: Path, path: Path) -> bool:
 
 
 def write_atomic(path: str | os.PathLike[str], data: str | bytes, *, replace: bool = True) -> None:
-    r"""Writes a whole file, or leaves the old one.
+    """Writes a whole file, or leaves the old one.
 
     Args:
         path: The file to write or replace; its folder is created if missing.
-        data: The content; text is written as UTF-8, line ends as they are.
-        replace: ``False`` keeps a file that is there by then, another process's.
-
-    Example:
-        >>> import tempfile
-        >>> file = Path(tempfile.mkdtemp()) / "note.txt"
-        >>> write_atomic(file, "good\n")
-        >>> file.read_bytes()
-        b'good\n'
+        data: The content. Text is written as UTF-8 with unchanged line ends.
+        replace: ``False`` to keep a file that another process has written meanwhile.
     """
     with atomic_path(path, replace=replace) as temporary:
         temporary.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Gives a file a second name, or a copy on another disk.
+    """Gives a file a second name, or copies it to another disk.
 
-    A file is replaced, never changed, so it may have two names.
+    Two names are safe because files are replaced and never modified.
 
     Args:
-        source: a file.
-        target: must not exist; its folder is created if missing.
-
-    Example:
-        >>> import tempfile
-        >>> folder = Path(tempfile.mkdtemp())
-        >>> write_atomic(folder / "a", "1")
-        >>> link_or_copy(folder / "a", folder / "b")
-        >>> (folder / "b").read_text()
-        '1'
+        source: The file.
+        target: Must not exist; its folder is created if missing.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -116,12 +105,13 @@ def link_or_copy(source: Path, target: Path) -> None:
 def new_folder(path: str | os.PathLike[str], *, exist_ok: bool = False) -> Iterator[Path]:
     """Yields a temporary folder that becomes ``path`` when the block succeeds.
 
-    It lies beside ``path``, has a leading dot and is removed if the block raises.
+    The temporary folder lies beside ``path``; its name starts with a dot. It is removed if the
+    block raises.
 
     Args:
-        path: must not exist; its parents are created.
-        exist_ok: another process may make the same folder meanwhile: it is kept, and this one's is
-            dropped.
+        path: Must not exist; its parents are created.
+        exist_ok: ``True`` to keep a folder that another process has made meanwhile, and to discard
+            this one.
 
     Raises:
         DataError: if ``path`` exists.
@@ -143,34 +133,25 @@ def new_folder(path: str | os.PathLike[str], *, exist_ok: bool = False) -> Itera
         temporary.mkdir()
         yield temporary
         for file in filter(Path.is_file, temporary.rglob("*")):
-            with file.open("r+b") as written:
-                # Without it a power cut after the rename may leave empty files in the folder.
-                os.fsync(written.fileno())
+            _sync(file)
         try:
             temporary.rename(path)
         except OSError:
             if not (exist_ok and path.is_dir()):
                 raise
-    finally:  # after an interrupt, too
+    finally:  # also after an interrupt
         shutil.rmtree(temporary, ignore_errors=True)
 
 
 def read_json(path: str | os.PathLike[str], what: str) -> Any:
-    """The content of a JSON file.
+    """Reads a JSON file.
 
     Args:
         path: The file.
-        what: What it should hold, for the message.
+        what: Description of the expected content, for the message.
 
     Raises:
-        DataError: if it is missing, damaged or nested beyond reason.
-
-    Example:
-        >>> import tempfile
-        >>> file = Path(tempfile.mkdtemp()) / "a.json"
-        >>> write_atomic(file, "[1, 2]")
-        >>> read_json(file, "two numbers")
-        [1, 2]
+        DataError: if it is missing, damaged or nested too deeply.
     """
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
@@ -179,18 +160,11 @@ def read_json(path: str | os.PathLike[str], what: str) -> Any:
 
 
 def write_rows(path: str | os.PathLike[str], rows: Sequence[Mapping[str, Any]]) -> None:
-    r"""Writes rows of equal keys as CSV, or leaves the old file.
+    """Writes a whole CSV file, or leaves the old one.
 
     Args:
         path: The file to write or replace.
-        rows: At least one; the keys of the first are the header.
-
-    Example:
-        >>> import tempfile
-        >>> file = Path(tempfile.mkdtemp()) / "a.csv"
-        >>> write_rows(file, [{"epoch": 1, "return": 0.5}])
-        >>> file.read_text()
-        'epoch,return\n1,0.5\n'
+        rows: At least one; all have the same keys, which become the header.
     """
     buffer = io.StringIO()
     writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
@@ -202,24 +176,24 @@ def write_rows(path: str | os.PathLike[str], rows: Sequence[Mapping[str, Any]]) 
 def read_rows(
     path: str | os.PathLike[str], columns: Mapping[str, Callable[[str], Any]]
 ) -> list[dict[str, Any]]:
-    """Reads columns of a CSV file, each value through its column's parser; others are ignored.
+    """Reads some columns of a CSV file.
 
     Args:
         path: The file.
-        columns: By name, what makes a value of a text. It raises ``ValueError`` with what is valid,
-            as :func:`whole`, :func:`finite` and :func:`one_of` do.
+        columns: A parser for each column's texts. It raises ``ValueError`` with a description of
+            valid texts, as :func:`whole`, :func:`finite` and :func:`one_of` do.
 
     Returns:
-        One dictionary a line, in the file's order.
+        One dictionary per line.
 
     Raises:
-        DataError: if the file or a column is missing, or a value is not valid; the message names
-            the file, line, column, value and what is valid.
+        DataError: naming file, line, column and value, if the file or a column is missing, or a
+            value is not valid.
 
     Example:
         >>> import tempfile
         >>> file = Path(tempfile.mkdtemp()) / "a.csv"
-        >>> write_rows(file, [{"epoch": 1, "return": 0.5}])
+        >>> write_rows(file, [{"epoch": 1, "return": 0.5, "note": "other columns are ignored"}])
         >>> read_rows(file, {"epoch": whole, "return": finite})
         [{'epoch': 1, 'return': 0.5}]
     """
@@ -244,20 +218,16 @@ def parse_row(
     path: Path,
     line: int,
 ) -> dict[str, Any]:
-    """One line of a CSV file, each value through its column's parser.
+    """Parses one line of a CSV file.
 
     Args:
-        record: The texts by column; ``None`` where the line is too short.
+        record: The texts by column; ``None`` if the line is too short.
         columns: As for :func:`read_rows`.
         path: The file, for the message.
-        line: Number of the line in it, for the message.
+        line: Its number, for the message.
 
     Raises:
         DataError: if a value is missing or not valid.
-
-    Example:
-        >>> parse_row({"epoch": "1", "seed": "0"}, {"epoch": whole}, Path("a.csv"), 2)
-        {'epoch': 1}
     """
     row = {}
     for column, parse in columns.items():
@@ -273,15 +243,7 @@ def parse_row(
 
 
 def whole(text: str) -> int:
-    """A whole number.
-
-    Raises:
-        ValueError: if the text is none.
-
-    Example:
-        >>> whole("12")
-        12
-    """
+    """Parses an integer, or raises ``ValueError``."""
     try:
         return int(text)
     except ValueError:
@@ -289,15 +251,7 @@ def whole(text: str) -> int:
 
 
 def number(text: str) -> float:
-    """A number; not finite ones are "nan" and "inf".
-
-    Raises:
-        ValueError: if the text is none.
-
-    Example:
-        >>> number("nan")
-        nan
-    """
+    """Parses a number, which may be "nan" or "inf", or raises ``ValueError``."""
     try:
         return float(text)
     except ValueError:
@@ -305,31 +259,17 @@ def number(text: str) -> float:
 
 
 def finite(text: str) -> float:
-    """A finite number.
-
-    Raises:
-        ValueError: if the text is none.
-
-    Example:
-        >>> finite("1e-3")
-        0.001
-    """
+    """Parses a finite number, or raises ``ValueError``."""
     try:
-        value = float(text)
+        if math.isfinite(value := float(text)):
+            return value
     except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError("a finite number")
-    return value
+        pass
+    raise ValueError("a finite number")
 
 
 def one_of(*valid: str) -> Callable[[str], str]:
-    """A parser of texts that are one of a few; it raises ``ValueError`` for another.
-
-    Example:
-        >>> one_of("a", "b")("b")
-        'b'
-    """
+    """Returns a parser that accepts these texts only."""
 
     def parse(text: str) -> str:
         if text not in valid:
@@ -340,13 +280,5 @@ def one_of(*valid: str) -> Callable[[str], str]:
 
 
 def flag(text: str) -> bool:
-    """A truth value, as 0 or 1.
-
-    Raises:
-        ValueError: if the text is neither.
-
-    Example:
-        >>> flag("1")
-        True
-    """
+    """Parses a truth value, written as 0 or 1, or raises ``ValueError``."""
     return one_of("0", "1")(text) == "1"

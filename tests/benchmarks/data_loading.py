@@ -33,17 +33,20 @@ from torchrl_bmrl.data.demonstrations import (
     write_statistics,
 )
 from torchrl_bmrl.data.robomimic import write_episodes
-from torchrl_bmrl.data.schema import OBSERVATION_SHAPES
-from torchrl_bmrl.names import HORIZON, TASKS
+from torchrl_bmrl.tasks import DemonstrationFiles, Task
 
-PAPER = {"reach": 500, "lift": 500} | {task: 100 for task in TASKS[2:]}
+HORIZON = 200
+PAPER = {"reach": 500, "lift": 500} | {f"push_{i}": 100 for i in range(4)}
+TASKS = [Task(name=name, files=DemonstrationFiles(path=f"{name}.hdf5")) for name in PAPER]
+SIZES = {
+    **{"robot0_joint_pos": 7, "robot0_gripper_qpos": 2, "robot0_joint_vel": 7},
+    **{"robot0_eef_pos": 3, "robot0_eef_quat": 4, "goal_pos": 3},
+}
 
 
 def random_episode(rng: np.random.Generator) -> Episode:
     """An episode as large as a collected one, model and states included."""
-    parts = {
-        name: rng.standard_normal((HORIZON + 1, size)) for name, size in OBSERVATION_SHAPES.items()
-    }
+    parts = {name: rng.standard_normal((HORIZON + 1, size)) for name, size in SIZES.items()}
     return Episode(
         observations={name: part[:-1] for name, part in parts.items()},
         next_observations={name: part[1:] for name, part in parts.items()},
@@ -87,12 +90,12 @@ def load(folder: Path, batch_size: int) -> tuple[dict[str, float], int, float, f
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     seconds: dict[str, float] = {}
     with timed("statistics, converting what is new", seconds):
-        write_statistics(folder, PAPER)
+        write_statistics(folder, TASKS)
     statistics = read_statistics(folder)
     with timed("transitions, normalised", seconds):
         data = [
-            load_transitions(folder, task, statistics, split="train", num_task=i)
-            for i, task in enumerate(PAPER)
+            load_transitions(folder, task, statistics, split="train", index=i)
+            for i, task in enumerate(TASKS)
         ]
     with timed("multi-task buffer", seconds):
         buffer = make_multi_task_replay_buffer(data, batch_size=batch_size)

@@ -27,11 +27,11 @@ from torchrl_bmrl.run.progress import progress
 
 
 def describe(source: Source, summary: Summary) -> Iterator[str]:
-    """Lines that tell a reader what a data set holds."""
+    """Yields the lines that describe a data set."""
     count, account = len(summary.lengths), summary.account
     yield f"{source.path}: {source.format}, {count} episodes, {sum(summary.lengths):,} steps"
     if wrong := len(source.episodes) - count:
-        yield f"  not counted       {wrong} episodes in which something is wrong"
+        yield f"  not counted       {wrong} episodes with faults"
     if count:
         yield f"  in the file       {account.whole}"
         yield f"  read              {account.read}"
@@ -80,13 +80,13 @@ def describe_relabelling(row: Relabelling) -> str:
 
 
 def reading(options: argparse.Namespace) -> dict[str, Any]:
-    """The options by which a source is read."""
+    """The options for reading a source."""
     names = [field.name for field in fields(ReadOptions)]
     return {name: getattr(options, name) for name in [*names, "task", "tracking"]}
 
 
 def check(options: argparse.Namespace) -> int:
-    """Prints a summary, the warnings and everything that is wrong; 1 if something is."""
+    """Prints a summary, warnings and faults; returns 1 if there are faults."""
     relabelled = []
     with open_source(options.file, **reading(options)) as source:
         with progress(len(source.episodes), "reading", "episode", delay=2, leave=False) as bar:
@@ -119,7 +119,7 @@ def check(options: argparse.Namespace) -> int:
 
 
 def convert_command(options: argparse.Namespace) -> int:
-    """Converts under a progress bar."""
+    """Converts with a progress bar."""
     with progress(None, "converting", "episode", delay=2, leave=False) as bar:
         done = convert(
             options.source,
@@ -146,8 +146,8 @@ def reading_options() -> argparse.ArgumentParser:
     group.add_argument(
         "--last-step",
         choices=get_args(LastStep),
-        help="what becomes of a last step after which no observation was recorded: leave it out, "
-        "or keep it, repeat its observation and bootstrap (truncate) or not (terminate)",
+        help="treatment of a last step without an observation after it: leave it out (drop), or "
+        "keep it, repeat its observation, and bootstrap (truncate) or not (terminate)",
     )
     group.add_argument(
         "--dones-terminate", action="store_true", help="dones at the last step is a termination"
@@ -155,7 +155,7 @@ def reading_options() -> argparse.ArgumentParser:
     group.add_argument(
         "--reward",
         choices=get_args(Reward),
-        help="1 where the episode succeeded, or at each last step, in place of the file's rewards",
+        help="1 for a solved task, or at each last step, instead of the file's rewards",
     )
     group.add_argument(
         "--successful", action="store_true", help="leave out the episodes that did not succeed"
@@ -166,7 +166,7 @@ def reading_options() -> argparse.ArgumentParser:
         type=_number_or_data,
         action=_Bounds,
         metavar=("LOW", "HIGH"),
-        help="of actions, or `data` for their range; else what the source states, or -1 1",
+        help="of actions, or `data` for their range; by default those of the source, or -1 1",
     )
     group.add_argument(
         "--horizon", type=int, help="steps of the longest episode (D4RL's files without timeouts)"
@@ -198,7 +198,7 @@ class _Bounds(argparse.Action):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; an expected error becomes one line and exit code 1."""
+    """Runs the command line; an expected error prints one line and returns exit code 1."""
     parser = argparse.ArgumentParser(
         prog="python -m torchrl_bmrl.data",
         description="Demonstrations of robomimic, robosuite, Isaac Lab, Minari, D4RL and LeRobot.",
@@ -207,7 +207,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     shared = [reading_options()]
     source = "HDF5 file, or folder of a Minari or LeRobot data set"
     parts = commands.add_parser(
-        "check", parents=shared, help="what a data set holds, and everything that is wrong with it"
+        "check", parents=shared, help="summarise a data set, and list its faults"
     )
     parts.add_argument("file", type=Path, help=source)
     parts.set_defaults(run=check)

@@ -1,10 +1,10 @@
-"""What a data set holds, what of it was read, and what was left out: nothing without a word."""
+"""Counts what a data set contains, what was read of it, and what was left out."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,21 +16,21 @@ from torchrl_bmrl.data.raw import RawEpisode, rewards_of
 from torchrl_bmrl.errors import DataError
 
 WAYS_OUT = (
-    "valid: last_step 'truncate' or 'terminate', which keep it, dones_terminate where dones say "
-    "that it terminates, or 'drop' to leave it out all the same"
+    "valid: last_step 'truncate' or 'terminate', which keep it, dones_terminate if dones mark a "
+    "termination, or last_step 'drop' to leave it out anyway"
 )
 
 
 @dataclass
 class Tally:
-    """Episodes, and what they add up to.
+    """Totals over episodes.
 
     Attributes:
-        episodes: how many.
-        steps: of all of them.
+        episodes: number of episodes.
+        steps: number of steps.
         reward: sum over all steps.
-        rewarded: steps whose reward is not 0.
-        successes: episodes that succeeded, of those that say so.
+        rewarded: number of steps with a reward other than 0.
+        successes: number of episodes that are known to have succeeded.
     """
 
     episodes: int = 0
@@ -40,13 +40,8 @@ class Tally:
     successes: int = 0
 
     def __add__(self, other: Tally) -> Tally:
-        return Tally(
-            self.episodes + other.episodes,
-            self.steps + other.steps,
-            self.reward + other.reward,
-            self.rewarded + other.rewarded,
-            self.successes + other.successes,
-        )
+        pairs = zip(astuple(self), astuple(other), strict=True)
+        return Tally(*(one + another for one, another in pairs))
 
     def include(self, rewards: np.ndarray, succeeded: bool | None) -> None:
         """Adds an episode."""
@@ -65,28 +60,16 @@ class Tally:
 
 @dataclass
 class Account:
-    """What was read of the episodes of a file, and what was not.
+    """What was read of a file's episodes, and what was left out.
 
-    The three tallies add up to what the file holds of the episodes that can be read.
+    The three tallies add up to all readable episodes of the file.
 
     Attributes:
-        read: what there is to train on.
-        cut: last steps without an observation after them.
-        failed: episodes that did not succeed, left out on request.
-        arrays: in how many episodes each array or group is left alone.
-        contradictions: names of episodes whose attribute ``success`` is not what ``successes`` say.
-
-    Example:
-        >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.ones(5)
-        >>> account = Account()
-        >>> account.add(
-        ...     "demo_0",
-        ...     Episode(
-        ...         observations=x, next_observations=x, actions=a, rewards=r, terminated=r > 1
-        ...     ),
-        ... )
-        >>> print(account.whole)
-        1 episodes, 5 steps, reward 5, 0 successes
+        read: the data to train on.
+        cut: last steps, left out because no observation follows them.
+        failed: unsuccessful episodes, left out on request.
+        arrays: for each array or group that is not read, the number of episodes with it.
+        contradictions: names of episodes whose attribute ``success`` contradicts ``successes``.
     """
 
     read: Tally = field(default_factory=Tally)
@@ -96,7 +79,7 @@ class Account:
     contradictions: list[str] = field(default_factory=list)
 
     def add(self, name: str, episode: Episode) -> None:
-        """Counts an episode that was read, and what was left out of it."""
+        """Counts an episode that was read, and the steps that were left out of it."""
         self.read.include(episode.rewards, episode.succeeded)
         left = episode.left_out
         self.cut += Tally(0, left.steps, left.reward, int(left.reward != 0), int(left.success))
@@ -106,7 +89,7 @@ class Account:
             self.contradictions.append(name)
 
     def add_failure(self, raw: RawEpisode, options: ReadOptions) -> None:
-        """Counts an episode that is left out, since it did not succeed."""
+        """Counts an episode that is left out because it did not succeed."""
         rewards = np.zeros(len(raw.actions))
         if raw.rewards is not None or options.reward is not None:
             rewards = rewards_of("", "", raw, options)
@@ -114,53 +97,53 @@ class Account:
 
     @property
     def whole(self) -> Tally:
-        """What the file holds."""
+        """Totals of the file."""
         return self.read + self.cut + self.failed
 
     def refusal(self, options: ReadOptions) -> tuple[str, str] | None:
-        """What is all lost with the steps that were cut: key and message."""
+        """Key and message of an error if all rewards or successes were in the steps left out."""
         if options.last_step is not None:
             return None
         cause = f"no observation after the last step was recorded; {WAYS_OUT}"
         if self.cut.rewarded and not self.read.rewarded:
-            message = f"all of the reward ({self.cut.reward:.6g}) is at last steps, and lost: "
-            return "rewards", message + cause
+            lost = f"all of the reward ({self.cut.reward:.6g}) is in last steps and would be lost"
+            return "rewards", f"{lost}: {cause}"
         if self.cut.successes and not self.read.successes:
-            message = f"all successes ({self.cut.successes}) are at last steps, and lost: "
-            return "successes", message + cause
+            lost = f"all successes ({self.cut.successes}) are in last steps and would be lost"
+            return "successes", f"{lost}: {cause}"
         return None
 
     def check(self, path: str | Path, options: ReadOptions) -> None:
-        """Refuses a data set that lost all of its reward, or all of its successes.
+        """Refuses a data set that would lose all of its reward, or all of its successes.
 
         Raises:
-            DataError: naming the sum that is lost and the ways out.
+            DataError: naming the total that would be lost, and the valid options.
         """
         if problem := self.refusal(options):
             raise DataError(path, *problem)
 
     def warnings(self) -> Iterator[str]:
-        """What was left out, in words."""
+        """Descriptions of what was left out."""
         if self.cut.steps:
             yield (
                 f"left out: {self.cut.steps} last steps with a reward of {self.cut.reward:.6g} of "
                 f"{(self.read + self.cut).reward:.6g} and {self.cut.successes} of "
-                f"{(self.read + self.cut).successes} successes, since no observation after them "
+                f"{(self.read + self.cut).successes} successes, because no observation after them "
                 "was recorded; last_step='truncate' or 'terminate' keeps them"
             )
         if self.failed.episodes:
-            yield f"left out on request, as not successful: {self.failed}"
+            yield f"left out on request, because not successful: {self.failed}"
         if self.contradictions:
             yield (
                 f"attribute success contradicts successes in {len(self.contradictions)} episodes, "
-                f"such as {self.contradictions[0]}; successes are believed"
+                f"such as {self.contradictions[0]}; successes are used"
             )
         if self.arrays:
             named = ", ".join(f"{name} ({count}x)" for name, count in self.arrays.items())
-            yield f"left alone in the episodes: {named}"
+            yield f"not read in the episodes: {named}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Steps, reward and successes by tally, as JSON takes them."""
+        """Steps, reward and successes by tally, ready for JSON."""
         return {
             name: {"steps": tally.steps, "reward": tally.reward, "successes": tally.successes}
             for name, tally in (("read", self.read), ("cut", self.cut), ("failed", self.failed))

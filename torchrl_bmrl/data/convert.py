@@ -1,4 +1,4 @@
-"""Any of the formats in, any of the formats out."""
+"""Converts data sets between formats."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ TARGETS = ("robomimic", "minari", "lerobot")
 
 @dataclass(frozen=True, kw_only=True)
 class Conversion:
-    """What was written, and what of the source was not.
+    """Result of a conversion.
 
     Attributes:
-        account: of the episodes, all sources together.
-        notes: what the new data set lacks, or has otherwise, in words.
+        account: of the episodes of all sources.
+        notes: descriptions of what was changed or left out.
     """
 
     account: Account
@@ -53,29 +53,30 @@ def convert(
     report: Callable[[int], object] = lambda _: None,
     **options: Any,
 ) -> Conversion:
-    """Writes a data set in another format, whole, or not at all; the source is only read.
+    """Writes a data set in another format, completely or not at all; the source is only read.
 
     Args:
-        source: an HDF5 file in robomimic's layout, of robosuite, of Isaac Lab or D4RL, the folder
-            of a Minari or LeRobot data set, or several of them, to become one.
-        target: what to write: a file for robomimic, a folder for LeRobot and for Minari, whose
-            names it ``<namespace>/<name>-v<number>``.
+        source: an HDF5 file in the layout of robomimic, robosuite, Isaac Lab or D4RL, or the folder
+            of a Minari or LeRobot data set. Several sources become one data set.
+        target: the new file (robomimic) or folder (LeRobot, Minari). Minari's folders are named
+            ``<namespace>/<name>-v<number>``.
         to: ``"robomimic"``, ``"minari"`` or ``"lerobot"``.
-        task: whose scene a robosuite ``demo.hdf5`` was recorded in.
+        task: the task in whose scene a robosuite ``demo.hdf5`` was recorded.
         tracking: see :func:`torchrl_bmrl.data.robosuite.open_episodes`.
         fps: steps per second [Hz]; ``None`` for the source's own.
         report: called with 1 after every episode.
-        options: how sources are read, see :class:`~torchrl_bmrl.data.options.ReadOptions`.
+        options: see :class:`~torchrl_bmrl.data.options.ReadOptions`.
 
     Returns:
-        what was read, and what is not in the new data set.
+        the account of what was read, and notes on what was changed or left out.
 
     Raises:
         UnknownNameError: for a format that cannot be written.
-        ConfigError: for options that the formats have no use for, for sources whose actions have
-            other bounds, and for LeRobot without ``fps`` where the source does not tell it.
-        DataError: naming file, key and row for what cannot be trained on, for a data set that would
-            lose all of its reward or successes, and for a target that exists or cannot be written.
+        ConfigError: for options that do not apply to the format, for sources with different bounds
+            of the actions, and for LeRobot without ``fps`` if the source does not state it.
+        DataError: naming file, key and row, for data that cannot be trained on; for a data set that
+            would lose all of its reward or successes; and for a target that exists or cannot be
+            written.
 
     Example:
         >>> import tempfile
@@ -97,7 +98,7 @@ def convert(
     if fps is not None:
         check_fps(fps)
     target = Path(target).expanduser()
-    # Once: an iterator of keys is at its end after the first source.
+    # Built once, because an iterator of keys is exhausted after the first source.
     options = vars(ReadOptions(**options))
     with open_sources(source, task=task, tracking=tracking, **options) as sources:
         stream = Stream(with_joint_range(sources), report)
@@ -108,7 +109,7 @@ def convert(
 
 @contextmanager
 def writing(target: Path) -> Iterator[None]:
-    """Refuses a target that exists, and reports in one way what the file system refuses.
+    """Refuses a target that exists, and turns errors of the file system into a DataError.
 
     Raises:
         DataError: if the target exists or cannot be written.
@@ -119,23 +120,25 @@ def writing(target: Path) -> Iterator[None]:
         yield
     except BMRLError:
         raise
-    except (OSError, RuntimeError) as error:  # RuntimeError: how h5py reports a full disk
+    except (OSError, RuntimeError) as error:  # RuntimeError: h5py's error on a full disk
         raise DataError(target, None, f"cannot be written ({error})") from error
 
 
 class Stream:
-    """The episodes of all sources on their way to a writer: each is checked and counted.
+    """Iterator over the episodes of all sources, which checks and counts each of them.
 
     Args:
         sources: open, in order.
         report: called with 1 after every episode.
     """
 
-    def __init__(self, sources: Sequence[Source], report: Callable[[int], object]) -> None:
+    def __init__(
+        self, sources: Sequence[Source], report: Callable[[int], object] = lambda _: None
+    ) -> None:
         self.sources, self.report = sources, report
         self.metadata = joined(sources)
         self.account = Account()
-        # What their file's attributes would say again: masks and totals are written anew.
+        # Writers set these attributes themselves.
         structure = ("env_args", "masks", "total", "action_bounds")
         self.attributes_of_file = {k: v for k, v in self.metadata.items() if k not in structure}
         self.extras: dict[str, None] = {}
@@ -144,14 +147,16 @@ class Stream:
 
     @property
     def names(self) -> list[str]:
+        """Names of all episodes."""
         return [name for source in self.sources for name in source.episodes]
 
     @property
     def fps(self) -> float | None:
-        """Steps per second [Hz], where all sources tell the same."""
+        """Steps per second [Hz]; ``None`` if the sources do not state it."""
         told = {source.fps for source in self.sources}
         if len(told) > 1:
-            raise ConfigError(f"the sources have {sorted(map(str, told))} steps a second; --fps?")
+            rates = ", ".join(sorted(map(str, told)))
+            raise ConfigError(f"the sources have {rates} steps per second; valid: --fps")
         return told.pop()
 
     def __iter__(self) -> Iterator[Episode]:
@@ -171,7 +176,7 @@ class Stream:
                 self._count(name, episode)
                 yield episode
                 self.report(1)
-        # Before the writer ends, so that nothing is written.
+        # Before the writer finishes, so that a refused data set is not written.
         self.account.check(self.sources[0].path, self.sources[0].options)
 
     def _count(self, name: str, episode: Episode) -> None:
@@ -184,17 +189,17 @@ class Stream:
         self.bounded = episode.actions.dtype.kind == "f"
 
     def notes(self, to: str) -> Iterator[str]:
-        """What the new data set lacks, or has otherwise."""
+        """Descriptions of what the new data set lacks or has changed."""
         for source in self.sources:
             where = f"{source.path}: " if len(self.sources) > 1 else ""
             yield from (f"{where}{oddity}" for oddity in source.oddities)
         yield from self.account.warnings()
         named = {"robomimic": "demo", "minari": "episode", "lerobot": "episode"}[to]
         renamed = [
-            f"{old} is {named}_{i} now" for i, old in enumerate(self.names) if old != f"{named}_{i}"
+            f"{old} to {named}_{i}" for i, old in enumerate(self.names) if old != f"{named}_{i}"
         ]
         if renamed:
-            yield f"renamed: {len(renamed)} episodes; {renamed[0]}"
+            yield f"renamed: {len(renamed)} episodes, such as {renamed[0]}"
         yield from self._dropped(to)
         if to == "lerobot":
             yield from lerobot.describe_losses(
@@ -205,14 +210,14 @@ class Stream:
             )
 
     def _dropped(self, to: str) -> Iterator[str]:
-        """What of the sources' metadata has no place in the new data set."""
+        """Metadata of the sources that are not in the new data set."""
         told = {str(source.metadata.get("env_args")) for source in self.sources}
         if len(told) > 1:
-            yield f"env_args differ between the sources: those of {self.sources[0].path} are kept"
+            yield f"env_args differ between the sources: those of {self.sources[0].path} are used"
         for mask in self.metadata["masks"]:
             lacking = [x.path for x in self.sources if mask not in x.metadata.get("masks", {})]
             if lacking:
-                yield f"mask {mask} has no episode of {lacking[0]}, which has no such mask"
+                yield f"mask {mask} has no episodes of {lacking[0]}, which has no such mask"
         keys = [key for source in self.sources for key in source.metadata]
         if to != "robomimic":
             bounds = ["action_bounds"] if to == "minari" and self.bounded else []
@@ -220,11 +225,11 @@ class Stream:
             dropped = [key for key in keys if key not in placed]
             dropped += [f"mask {name}" for name in self.metadata["masks"]]
         else:
-            # Bounds are equal, however they are written.
+            # The bounds are equal, even if they are written differently.
             dropped = [key for key in keys if key not in (*self.metadata, "action_bounds")]
         if dropped:
             names = ", ".join(dict.fromkeys(dropped))
-            yield f"left out, as the data set has no place for it: {names}"
+            yield f"left out, because the format has no place for it: {names}"
 
 
 def _write(target: Path, to: str, stream: Stream, fps: float | None) -> None:
@@ -246,6 +251,6 @@ def _write(target: Path, to: str, stream: Stream, fps: float | None) -> None:
     if to == "minari":
         minari.write_episodes(target, stream, fps=fps, description=str(name), bounds=bounds)
     elif fps is None:
-        raise ConfigError("the source does not tell its steps per second; valid: --fps")
+        raise ConfigError("the source does not state its steps per second; valid: --fps")
     else:
         lerobot.write_episodes(target, stream, fps=fps, task=str(name))

@@ -1,4 +1,4 @@
-"""D4RL's flat HDF5 layout: all steps of a data set in one array each, read episode by episode.
+"""Reads D4RL's flat HDF5 layout: each array holds the steps of all episodes.
 
 Layout of a file of N steps::
 
@@ -11,28 +11,20 @@ Layout of a file of N steps::
     infos/<name>         (N, ...)
     metadata/<name>      texts and numbers about the data set
 
-Rows of one number may be ``(N, 1)`` as well. What else has N rows of numbers is kept as it is.
+Rows of one number may also be ``(N, 1)``. Other arrays of N rows of numbers are read as they are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torchrl_bmrl.data.arrays import as_flags, check_finite
-from torchrl_bmrl.data.d4rl_layout import (
-    AFTER,
-    ARRAYS,
-    BEFORE,
-    Flat,
-    as_column,
-    find_jumps,
-    walk,
-)
+from torchrl_bmrl.data.arrays import as_column, as_flags, check_finite
+from torchrl_bmrl.data.d4rl_layout import AFTER, ARRAYS, BEFORE, Flat, find_jumps, walk
 from torchrl_bmrl.data.episodes import LazyEpisodes
 from torchrl_bmrl.data.hdf5 import (
     open_file,
@@ -42,7 +34,7 @@ from torchrl_bmrl.data.hdf5 import (
     read_node,
     read_strings,
 )
-from torchrl_bmrl.data.raw import RawEpisode
+from torchrl_bmrl.data.raw import Opened, RawEpisode
 from torchrl_bmrl.extras import needs
 
 with needs("data"):
@@ -56,98 +48,58 @@ def is_d4rl(path: str | Path, file: h5py.File) -> bool:
 
 
 @contextmanager
-def open_raw(path: str | Path, *, horizon: int | None = None) -> Iterator[Mapping[str, RawEpisode]]:
-    """Opens a file; an episode is read when it is asked for, and no other row with it.
+def open_data(path: str | Path, *, horizon: int | None = None) -> Iterator[Opened]:
+    """Opens a file; each episode is read on access.
 
     An episode ends at a terminal and at a timeout. In files without ``timeouts`` it ends at a
-    terminal and after ``horizon`` steps, which is how D4RL's own tools cut; without a horizon, at a
-    terminal and where the next observation is not the next row's. Files without any of the three
-    are refused: their episodes cannot be told from each other. The rows after the last end are an
-    episode, too, which was cut.
+    terminal and after ``horizon`` steps, as D4RL's own tools cut; without a horizon, at a terminal
+    and where the next observation is not the next row's. Files with none of the three are refused,
+    because nothing separates their episodes. The rows after the last end are one more episode,
+    which was cut.
 
-    ``infos/<name>`` becomes the extra ``<name>``, and ``infos/<a>/<b>`` the extra ``<a>_<b>``;
-    ``success``, row t after step t, becomes ``successes``. What is not read is named in
-    ``left_alone``.
+    ``infos/<name>`` becomes the extra ``<name>``, and ``infos/<a>/<b>`` the extra ``<a>_<b>``.
+    ``success``, whose row t follows step t, becomes ``successes``. ``left_alone`` lists what is not
+    read.
 
     Args:
         path: the HDF5 file; it is only read.
-        horizon: steps of the longest episode, for files without ``timeouts``. One of N steps or
-            more says that terminals alone end episodes.
+        horizon: steps of the longest episode, for files without ``timeouts``. If it is at least N,
+            terminals alone end episodes.
 
     Yields:
-        the episodes by their rows, ``rows_0_to_199``, ...; to be read inside the block.
-        ``next_observations`` is ``None`` where the file has none.
+        the episodes, named by their rows (``rows_0_to_199``, ...); the file's attributes together
+        with attributes, texts and numbers below ``metadata``; and oddities.
+        ``next_observations`` is ``None`` if the file has none.
 
     Raises:
-        DataError: naming file, key and the file's own row, for a file that is missing or damaged,
-            arrays that are missing or of different lengths, ends that cannot be known, flags other
-            than 0 and 1, and numbers that are not finite. The last is raised when the episode is
-            read.
-        ConfigError: for a horizon below 1, or of a file with ``timeouts``.
-
-    Example:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "hopper.hdf5"
-        >>> with h5py.File(path, "w") as file:
-        ...     file["observations"], file["actions"] = np.zeros((9, 3)), np.zeros((9, 2))
-        ...     file["rewards"], file["terminals"] = np.ones(9), np.arange(9) == 3
-        ...     file["timeouts"] = np.arange(9) == 6
-        >>> with open_raw(path) as episodes:
-        ...     {name: len(raw.actions) for name, raw in episodes.items()}
-        {'rows_0_to_3': 4, 'rows_4_to_6': 3, 'rows_7_to_8': 2}
+        DataError: naming file, key and row, for a missing or damaged file, arrays that are missing
+            or of different lengths, unknown ends of episodes, flags other than 0 and 1, and numbers
+            that are not finite. The last is raised when the episode is read.
+        ConfigError: for a horizon below 1, or with a file that has ``timeouts``.
     """
     with open_file(path) as file:
         flat = Flat.of(path, file, horizon)
+        metadata = read_attributes(path, file, "/")
+        beside: list[str] = []
+        if isinstance(read_node(path, file, "metadata"), h5py.Group):
+            told, beside = _read_group(path, file, "metadata")
+            metadata |= told
+        oddities = list(_end_oddities(path, file, flat, horizon))
+        if beside:
+            oddities.append(
+                f"{len(beside)} arrays below metadata are not read, such as {beside[0]}"
+            )
         names = {f"rows_{rows.start}_to_{rows.stop - 1}": rows for rows in flat.episodes()}
-        # HDF5 forgets what it has decompressed of an array when the last who has it open closes it,
-        # and the next episode lies in the same chunk.
+        # HDF5 drops the decompressed chunks of an array when its last handle is closed, and the
+        # next episode lies in the same chunk.
         keys = ["actions", "rewards", *flat.parts.values(), *flat.after.values()]
-        opened = [read_node(path, file, key) for key in [*keys, *flat.extras.values()]]
+        handles = [read_node(path, file, key) for key in [*keys, *flat.extras.values()]]
 
         def read(name: str) -> RawEpisode:
             return _read_episode(path, file, flat, names[name])
 
-        yield LazyEpisodes(names, read)
-        del opened
-
-
-def read_metadata(path: str | Path) -> dict[str, Any]:
-    """What a file says about itself.
-
-    Returns:
-        ``attributes`` of the file, and ``metadata``: attributes, texts and numbers of the group of
-        that name, those of groups in it by their path.
-
-    Raises:
-        DataError: if the file is missing or damaged.
-    """
-    with open_file(path) as file:
-        told = {"attributes": read_attributes(path, file, "/"), "metadata": {}}
-        if isinstance(read_node(path, file, "metadata"), h5py.Group):
-            told["metadata"] = _read_group(path, file, "metadata")[0]
-        return told
-
-
-def find_oddities(path: str | Path, *, horizon: int | None = None) -> list[str]:
-    """What deserves a look in a file beside its episodes: warnings.
-
-    Args:
-        path: the HDF5 file.
-        horizon: as for :func:`open_raw`.
-
-    Raises:
-        DataError: as :func:`open_raw`.
-    """
-    with open_file(path) as file:
-        flat = Flat.of(path, file, horizon)
-        oddities = list(_end_oddities(path, file, flat, horizon))
-        if isinstance(read_node(path, file, "metadata"), h5py.Group):
-            beside = _read_group(path, file, "metadata")[1]
-            if beside:
-                oddities.append(
-                    f"{len(beside)} arrays below metadata are left alone, such as {beside[0]}"
-                )
-    return oddities
+        yield Opened(episodes=LazyEpisodes(names, read), metadata=metadata, oddities=oddities)
+        del handles
 
 
 def _end_oddities(
@@ -194,7 +146,7 @@ def _read_episode(path: str | Path, file: h5py.File, flat: Flat, rows: slice) ->
         return array
 
     actions = read("actions")
-    if actions.ndim == 1 and actions.dtype.kind == "f":  # else it is the number of a choice
+    if actions.ndim == 1 and actions.dtype.kind == "f":  # integers are indices of discrete actions
         actions = actions[:, None]
     extras = {name: read(key) for name, key in flat.extras.items()}
     if "successes" in extras:
@@ -213,7 +165,7 @@ def _read_episode(path: str | Path, file: h5py.File, flat: Flat, rows: slice) ->
 
 
 def _read_group(path: str | Path, file: h5py.File, key: str) -> tuple[dict[str, Any], list[str]]:
-    """Attributes, texts and numbers of a group and of those in it, and keys of what is larger."""
+    """Attributes, texts and numbers in a group and its subgroups, and keys of larger arrays."""
     told, beside = read_attributes(path, file, key), []
     for where in walk(path, file, key):
         node = read_node(path, file, where)

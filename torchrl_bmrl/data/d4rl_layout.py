@@ -1,16 +1,15 @@
-"""Where things are in a file of D4RL's flat layout: see :mod:`torchrl_bmrl.data.d4rl`."""
+"""Finds the arrays and the ends of episodes in a file of :mod:`torchrl_bmrl.data.d4rl`'s layout."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from torchrl_bmrl.data.arrays import as_flags
-from torchrl_bmrl.data.hdf5 import read_array, read_names, read_node
+from torchrl_bmrl.data.arrays import as_column, as_flags, check_lengths
+from torchrl_bmrl.data.hdf5 import has_rows, read_array, read_names, read_node
 from torchrl_bmrl.data.robomimic import STEP_KEYS
 from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.extras import needs
@@ -21,24 +20,24 @@ with needs("data"):
 ARRAYS = ("actions", "rewards", "terminals", "timeouts")
 BEFORE, AFTER = "observations", "next_observations"
 BLOCK = 2**24
-"""Bytes of an array that are compared at a time."""
+"""Number of bytes of an array that are compared at once."""
 DEPTH = 6
-"""Groups in groups that are followed."""
+"""Greatest depth of nested groups that is searched."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Flat:
-    """Where things are in a file.
+    """The arrays of a file, and where its episodes end.
 
     Attributes:
         steps: N.
         parts: keys of the observation's parts by name.
-        after: keys of the same parts of the next observation; empty where there is none.
-        rewards: whether there are any.
+        after: keys of the same parts of the next observation; empty if there is none.
+        rewards: whether the file has rewards.
         terminals: ``(N,)`` bool.
-        timeouts: ``(N,)`` bool, where the file has them.
+        timeouts: ``(N,)`` bool, if the file has them.
         ends: ``(N,)`` bool: last rows of episodes.
-        ended: whether the file says that its last row is one.
+        ended: whether the file marks its last row as an end.
         extras: keys of further arrays of N rows by name.
         left_alone: keys of what is not read.
     """
@@ -61,7 +60,7 @@ class Flat:
 
     @classmethod
     def of(cls, path: str | Path, file: h5py.File, horizon: int | None) -> Flat:
-        """Looks at a file, whose large arrays are not read."""
+        """Inspects a file without reading its large arrays."""
         present = read_names(path, file, "/")
         parts, beside = _find_parts(path, file, BEFORE)
         after: dict[str, str] = {}
@@ -102,30 +101,30 @@ def _find_ends(path: str | Path, file: h5py.File, flat: Flat, horizon: int | Non
         if flat.timeouts is not None:
             raise ConfigError(f"horizon is {horizon}, but {path} has timeouts; valid: None")
         rows = np.arange(flat.steps)
-        # Row of the episode's first step, for rows after a terminal.
+        # For each row, the row after the last terminal before it.
         first = np.maximum.accumulate(np.where(np.roll(flat.terminals, 1), rows, 0))
         return flat.terminals | ((rows - first) % horizon == horizon - 1)
     if flat.timeouts is not None:
         return flat.terminals | flat.timeouts
     valid = "valid: timeouts (N,), or a horizon, the longest episode's steps"
     if not flat.after:
-        message = f"missing, and {AFTER} as well: where episodes were cut cannot be known"
+        message = f"missing, and so is {AFTER}: it is unknown where episodes were cut"
         raise DataError(path, "timeouts", f"{message}; {valid}")
     jumps = find_jumps(path, file, flat)
     inner = flat.terminals[:-1]
     if inner.any() and not jumps[:-1].any():
         row = int(np.flatnonzero(inner)[0])
         message = (
-            f"row {row} is the next row's observation, though row {row} is terminal: made by "
-            "shifting, it does not tell where episodes were cut"
+            f"row {row} is the next row's observation although row {row} is terminal: the array "
+            "was made by shifting and does not show where episodes were cut"
         )
         raise DataError(path, AFTER, f"{message}; {valid}")
-    jumps[-1] = False  # nothing tells
+    jumps[-1] = False  # unknown: there is no next row
     return flat.terminals | jumps
 
 
 def find_jumps(path: str | Path, file: h5py.File, flat: Flat) -> np.ndarray:
-    """Whether each row's next observation is another than the next row's; true of the last."""
+    """Whether each row's next observation differs from the next row; true for the last row."""
     jumps = np.arange(flat.steps) == flat.steps - 1
     for part, key in flat.parts.items():
         node = read_node(path, file, key)
@@ -139,7 +138,7 @@ def find_jumps(path: str | Path, file: h5py.File, flat: Flat) -> np.ndarray:
 
 
 def _find_parts(path: str | Path, file: h5py.File, key: str) -> tuple[dict[str, str], list[str]]:
-    """Keys of the observation's parts by name, and of what lies beside them."""
+    """Keys of the observation's parts by name, and keys of other arrays beside them."""
     node = read_node(path, file, key)
     if not isinstance(node, h5py.Group):
         return {"observation": key}, []
@@ -151,14 +150,14 @@ def _find_parts(path: str | Path, file: h5py.File, key: str) -> tuple[dict[str, 
         else:
             beside.append(f"{key}/{part}")
     if not parts:
-        raise DataError(path, key, "no part of an observation; valid: at least one")
+        raise DataError(path, key, "no part of the observation; valid: at least one")
     return parts, beside
 
 
 def _find_extras(
     path: str | Path, file: h5py.File, present: list[str], steps: int
 ) -> tuple[dict[str, str], list[str]]:
-    """Keys of further arrays of a row for each step by name, and of what is left alone."""
+    """Keys of further arrays with a row for each step by name, and keys of those not read."""
     extras: dict[str, str] = {}
     beside = []
     known = {BEFORE, AFTER, *ARRAYS}
@@ -168,13 +167,13 @@ def _find_extras(
             keys += walk(path, file, key) if key == "infos" else []
         elif key not in known:
             keys.append(key)
-    # Those of the infos come before others of their names.
+    # Arrays below infos take precedence over others with the same name.
     for key in sorted(keys, key=lambda key: not key.startswith("infos/")):
         name = key.removeprefix("infos/").replace("/", "_")
         name = "successes" if name == "success" else name
         if name == "successes" and name not in extras:
             _check_lengths(path, file, [key], steps)
-        if name in extras or name in STEP_KEYS or not _has_rows(path, file, key, steps):
+        if name in extras or name in STEP_KEYS or not has_rows(read_node(path, file, key), steps):
             beside.append(key)
         else:
             extras[name] = key
@@ -182,10 +181,10 @@ def _find_extras(
 
 
 def walk(path: str | Path, file: h5py.File, key: str) -> Iterator[str]:
-    """Keys of all datasets below a group, and of groups that lie deep, as in a circle of links.
+    """Keys of all datasets below a group, and of groups deeper than the limit (circular links).
 
     Raises:
-        DataError: for links to another file, and what is damaged.
+        DataError: for links to another file, and for damaged nodes.
     """
     for name in read_names(path, file, key):
         where = f"{key}/{name}"
@@ -196,35 +195,17 @@ def walk(path: str | Path, file: h5py.File, key: str) -> Iterator[str]:
             yield where
 
 
-def _has_rows(path: str | Path, file: h5py.File, key: str, steps: int) -> bool:
-    node = read_node(path, file, key)
-    if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "biuf":
-        return False
-    return node.shape[:1] == (steps,) and bool(node.size)
-
-
 def _check_lengths(
     path: str | Path, file: h5py.File, keys: list[str], steps: int | None = None
 ) -> int:
-    """Rows that arrays have in common; without ``steps``, as most of them have."""
+    """Rows that the arrays have in common; without ``steps``, as many as most of them have."""
     shapes = {}
     for key in keys:
         node = read_node(path, file, key)
         if not isinstance(node, h5py.Dataset):
             raise DataError(path, key, "missing" if node is None else "a group; valid: a dataset")
-        if not node.shape:
-            raise DataError(path, key, "one number; valid: a row for each step")
         shapes[key] = node.shape
-    # Where one array differs from all others, it is the one at fault.
-    if steps is None:
-        steps = Counter(shape[0] for shape in shapes.values()).most_common(1)[0][0]
-    for key, shape in shapes.items():
-        if shape[0] != steps:
-            message = f"shape {shape}; valid: {steps} rows, as most arrays have"
-            raise DataError(path, key, message)
-    if not steps:
-        raise DataError(path, keys[0], f"shape {shapes[keys[0]]}; valid: at least one row")
-    return steps
+    return check_lengths(path, "", shapes, steps=steps)
 
 
 def _check_alike(path: str | Path, file: h5py.File, before: str, after: str) -> None:
@@ -238,14 +219,3 @@ def _check_alike(path: str | Path, file: h5py.File, before: str, after: str) -> 
 def _read_flags(path: str | Path, file: h5py.File, key: str) -> np.ndarray:
     flags = as_column(path, key, read_array(path, file, key))
     return as_flags(path, key, flags)
-
-
-def as_column(path: str | Path, key: str, array: np.ndarray) -> np.ndarray:
-    """An array of one number in each row as ``(T,)``.
-
-    Raises:
-        DataError: for larger rows.
-    """
-    if array.shape[1:] not in ((), (1,)):
-        raise DataError(path, key, f"rows of shape {array.shape[1:]}; valid: of one number")
-    return array.reshape(len(array))

@@ -1,4 +1,4 @@
-"""Files of demonstrations as TorchRL data sets: memory-mapped, sliced, loaded by name."""
+"""Files of demonstrations as memory-mapped TorchRL data sets."""
 
 from __future__ import annotations
 
@@ -23,76 +23,70 @@ from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs.transforms import Transform
 
+from torchrl_bmrl.data.convert import Stream
 from torchrl_bmrl.data.episodes import as_tensordict
 from torchrl_bmrl.data.options import Bounds, LastStep, ReadOptions, Reward
 from torchrl_bmrl.data.robomimic import count_steps
 from torchrl_bmrl.data.sampler import HandsOutCopies, read_memmap
-from torchrl_bmrl.data.schema import check_episode, layout_of
-from torchrl_bmrl.data.sources import Source, find_format, open_source
+from torchrl_bmrl.data.sources import find_format, open_source
 from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.files import new_folder
 from torchrl_bmrl.functional import mean_and_scale
 
 LAYOUT_VERSION = 3
-"""Part of a cache's name: another version converts anew."""
+"""Part of the hash in a cache's name: another version converts anew."""
 ATTEMPTS = 3
-"""Conversions before a file system that gives back other data than were written is reported."""
+"""Attempts to convert before a file system that corrupts data is reported."""
 
 
 class FixedStorage(HandsOutCopies, TensorStorage):
-    """Data that belong to a file: nothing writes to them, and a dump leaves them where they are."""
+    """Read-only data of a file; dumps and states leave them out."""
 
     def set(self, *args: Any, **kwargs: Any) -> None:
-        """Refuses.
-
-        Raises:
-            BMRLError: always.
-        """
-        raise BMRLError("the data of a file are read only; copy them: replay[:].clone()")
+        """Raises a BMRLError: the data are read-only."""
+        raise BMRLError("the data of a file are read-only; copy them: replay[:].clone()")
 
     def dumps(self, path: str | Path) -> None:
-        """Writes nothing: the file has the data."""
+        """Writes nothing."""
 
     def loads(self, path: str | Path) -> None:
-        """Reads nothing: the data are there."""
+        """Reads nothing."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Nothing."""
+        """An empty state."""
         return {}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Takes nothing."""
+        """Loads nothing."""
 
 
 class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
-    """Demonstrations of a file in robomimic's HDF5 layout, as a replay buffer.
+    """Replay buffer over the demonstrations of a file in robomimic's HDF5 layout.
 
     The file is converted once, episode by episode, into memory-mapped tensors beside it (or under
-    ``root``), in a folder named after its content and what was asked for; the file itself is only
-    read. Two processes may convert at once: one result is kept.
+    ``root``), in a folder named after a hash of its content and the options. The file itself is
+    only read. If two processes convert it at once, one result is used.
 
-    Keys, batch ``[N]``: each part of the observation under its own name, as ``GymEnv`` shows
-    dictionaries, the same under ``"next"``, ``action``, ``("next", "reward")``,
-    ``("next", "done")``, ``("next", "terminated")``, ``("next", "truncated")``, where the file has
-    ``successes`` ``("next", "success")``, each ``(N, 1)``, and ``episode`` and ``step`` ``(N,)``.
-    Observations keep their dtype; floating-point actions and rewards are float32. An episode's last
-    step is ``truncated`` unless the file says that it is terminated.
+    Keys, batch ``[N]``: each part of the observation under its own name, as in ``GymEnv``, and
+    under ``"next"``; ``action``; ``("next", "reward")``, ``("next", "done")``,
+    ``("next", "terminated")``, ``("next", "truncated")`` and, if the file has ``successes``,
+    ``("next", "success")``, each ``(N, 1)``; ``episode`` and ``step`` ``(N,)``. Observations keep
+    their dtype; floating-point actions and rewards are float32. An episode's last step is
+    ``truncated`` unless the file states that it is terminated.
 
     Args:
         dataset_id: the file.
-        batch_size: of samples; may be given to ``sample`` instead.
-        root: folder of the converted data; the file's own by default.
+        batch_size: of the samples, if not given to ``sample``.
+        root: folder of the converted data; the file's folder by default.
         split: name of a mask, such as ``"train"``; ``None`` for all demonstrations.
         observation_keys: parts of the observation; ``None`` for all.
-        dones_terminate: ``dones`` at the last step is a termination (files without ``terminated``).
-        last_step: ``"drop"``, ``"truncate"`` or ``"terminate"``: what becomes of a last step after
-            which no observation was recorded.
-        reward: ``"success"`` or ``"last"``: where rewards come from, if not from the file.
-        successful: leaves out the episodes that did not succeed.
-        bounds: ``(low, high)`` of floating-point actions, or ``"data"``; by default those that the
-            file states, else [-1, 1]. :class:`~torchrl_bmrl.data.options.ReadOptions` says more of
-            these options.
-        split_trajs: one row per episode, padded with zeros; ``mask`` tells the steps from them.
+        dones_terminate: as this and the next four options of
+            :class:`~torchrl_bmrl.data.options.ReadOptions`.
+        last_step: see there.
+        reward: see there.
+        successful: see there.
+        bounds: see there.
+        split_trajs: one row per episode, padded with zeros; ``mask`` is ``False`` for the padding.
         sampler: a ``RandomSampler`` by default; ``SliceSampler(traj_key="episode", ...)`` works.
         writer: an ``ImmutableDatasetWriter`` by default.
         collate_fn: of the samples.
@@ -153,12 +147,12 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
             bounds=bounds,
         )
         self.dataset_id = str(dataset_id)
-        # Absolute: the working directory may change before the folder is looked at again.
+        # Absolute, because the working directory may change before the folder is read again.
         source = Path(dataset_id).expanduser().absolute()
         self.root = source.parent if root is None else Path(root).expanduser().absolute()
         options = asdict(chosen)
         if chosen.observation_keys is not None:
-            # In one order, so that one folder serves them all.
+            # Sorted, so that one folder serves all orders.
             options["observation_keys"] = sorted(chosen.observation_keys)
         self._path = self.root / f"{source.stem}-{_digest(source, options, split_trajs)}"
         read = _read(self._path)
@@ -169,8 +163,8 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
             _convert(source, self._path, options, split_trajs)
             read = _read(self._path)
         if read is None:
-            message = "cannot be read back as it was written, or replaced; valid: root=, a folder"
-            raise DataError(source, None, f"its conversion {self._path} {message} on a sound disk")
+            message = "is damaged as soon as it is written; valid: root=, a folder on a sound disk"
+            raise DataError(source, None, f"its conversion {self._path} {message}")
         data, self._metadata = read
         for text in self.metadata["warnings"]:
             warnings.warn(f"{source}: {text}", stacklevel=2)
@@ -192,7 +186,7 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
 
     @property
     def data_path_root(self) -> Path:
-        """The same folder: splits have folders of their own."""
+        """The same folder: each split has its own."""
         return self._path
 
     def _is_downloaded(self) -> bool:
@@ -200,18 +194,18 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """What is known of the data beside them.
+        """Metadata of the data.
 
-        Attributes of the file with its ``env_args`` and ``masks``; ``episodes``, their names in
-        order; ``statistics``, mean (``loc``) and standard deviation (``scale``, 1 where a dimension
-        is constant) of the actions and of every part of the observation that is a vector of
-        floating-point numbers, ready for ``ObservationNorm``.
+        The file's attributes, ``env_args`` and ``masks``; ``episodes``, their names in order;
+        ``statistics``, for ``ObservationNorm``: mean (``loc``) and standard deviation (``scale``, 1
+        for a constant dimension) of the actions and of each part of the observation that is a
+        vector of floating-point numbers; ``account``, ``warnings`` and ``oddities``.
         """
         return json.loads(self._metadata)
 
 
 def _read(path: Path) -> tuple[TensorDict, str] | None:
-    """Data and metadata of a conversion; ``None`` if there is none, or not as it was written."""
+    """Data and metadata of a conversion; ``None`` if it is missing or damaged."""
     metadata = _read_metadata(path)
     if metadata is None:
         return None
@@ -219,14 +213,14 @@ def _read(path: Path) -> tuple[TensorDict, str] | None:
         data = read_memmap(path / "data")
     except DataError:
         return None
-    # Another process may have removed it meanwhile: what is not there, tensordict leaves out.
+    # Another process may be removing it: tensordict skips missing files.
     leaves = len(list(data.keys(include_nested=True, leaves_only=True)))
     files = sum(name.endswith(".memmap") for name in json.loads(metadata)["crc32"])
     return (data, metadata) if leaves == files else None
 
 
 def _read_metadata(path: Path) -> str | None:
-    """The metadata of a conversion whose every file is as it was written."""
+    """The metadata of a conversion; ``None`` unless all checksums of its files match."""
     try:
         text = (path / "metadata.json").read_bytes()
         if (path / "metadata.crc32").read_text() != f"{zlib.crc32(text):08x}":
@@ -238,7 +232,7 @@ def _read_metadata(path: Path) -> str | None:
 
 
 def _crc32(file: Path) -> str:
-    """Checksum of a file: it finds every flipped byte, at several times the speed of a SHA-256."""
+    """CRC-32 of a file. It detects every flipped byte, several times as fast as SHA-256."""
     crc, block = 0, bytearray(1 << 20)
     with file.open("rb", buffering=0) as stream:
         while size := stream.readinto(block):
@@ -247,18 +241,18 @@ def _crc32(file: Path) -> str:
 
 
 def _set_aside(path: Path) -> None:
-    """Removes a damaged conversion, if there is one."""
-    # Renamed first: other processes find a whole folder under the name, or none.
+    """Removes a damaged conversion, if any."""
+    # Renamed first, so that other processes never see a partial folder under its name.
     aside = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
         path.rename(aside)
-    except OSError:  # none, or a folder that cannot be written: converting will say so
+    except OSError:  # no conversion, or a read-only folder, which converting reports
         return
     shutil.rmtree(aside, ignore_errors=True)
 
 
 def _digest(source: Path, options: Mapping[str, Any], split_trajs: bool) -> str:
-    """Names the content of a file and what is made of it."""
+    """Hash of a file's content and of the options."""
     if not source.is_file():
         raise DataError(source, None, "no such file")
     digest = hashlib.sha256(json.dumps([LAYOUT_VERSION, dict(options), split_trajs]).encode())
@@ -272,7 +266,7 @@ def _digest(source: Path, options: Mapping[str, Any], split_trajs: bool) -> str:
 
 
 def _convert(source: Path, target: Path, options: Mapping[str, Any], split_trajs: bool) -> None:
-    """Converts a file into a folder that appears whole, or not at all."""
+    """Converts a file into a folder that appears as a whole, or not at all."""
     try:
         with new_folder(target, exist_ok=True) as folder:
             if (form := find_format(source)) != "robomimic":
@@ -280,12 +274,12 @@ def _convert(source: Path, target: Path, options: Mapping[str, Any], split_trajs
             with open_source(source, to_train=True, **options) as data_set:
                 data_set.check()
                 steps = count_steps(source, data_set.episodes)
-                data = _write_rows(folder / "data", data_set, steps)
-                data_set.account.check(source, data_set.options)
+                stream = Stream([data_set])
+                data = _write_rows(folder / "data", stream, steps)
                 metadata = dict(data_set.metadata) | {
                     "episodes": list(data_set.episodes),
-                    "account": data_set.account.as_dict(),
-                    "warnings": list(data_set.account.warnings()),
+                    "account": stream.account.as_dict(),
+                    "warnings": list(stream.account.warnings()),
                     "oddities": list(data_set.oddities),
                 }
             metadata["statistics"] = _statistics(data)
@@ -316,28 +310,17 @@ def _other_format(source: Path, form: str) -> str:
     )
 
 
-def _write_rows(path: Path, source: Source, steps: int) -> TensorDict:
-    """Writes episodes one after the other into memory-mapped tensors.
-
-    Only one episode is in memory at a time, however large the data set.
-
-    Args:
-        path: folder of the tensors.
-        source: whose episodes, which its account counts.
-        steps: of all of them together.
+def _write_rows(path: Path, stream: Stream, steps: int) -> TensorDict:
+    """Writes one episode after the other into memory-mapped tensors of ``steps`` rows in total.
 
     Raises:
         DataError: for the first episode that cannot be trained on.
         OSError: if the folder cannot be written or the disk is full.
     """
-    layout, start = None, 0
-    for number, name in enumerate(source.episodes):
-        episode = source.episodes[name]
-        check_episode(source.path, f"data/{name}", episode, layout=layout, bounds=source.bounds)
-        source.account.add(name, episode)
+    data, start = TensorDict(), 0
+    for number, episode in enumerate(stream):
         rows = as_tensordict(episode, number=number)
-        if layout is None:
-            layout = layout_of(episode)
+        if not number:
             data = _allocate(rows[:1].expand(steps), path)
         data[start : start + len(rows)] = rows
         start += len(rows)
@@ -345,7 +328,7 @@ def _write_rows(path: Path, source: Source, steps: int) -> TensorDict:
 
 
 def _statistics(data: TensorDict) -> dict[str, dict[str, list[float]]]:
-    """Mean and standard deviation of the vectors among the observation's parts and the actions."""
+    """Mean and standard deviation of the actions and of the observation's vectors."""
     statistics = {}
     for key, part in data.items():
         if isinstance(part, Tensor) and part.is_floating_point() and part.ndim == 2:
@@ -355,7 +338,7 @@ def _statistics(data: TensorDict) -> dict[str, dict[str, list[float]]]:
 
 
 def _split(path: Path) -> None:
-    """Replaces flat data by one padded row per episode."""
+    """Replaces the steps of all episodes by one padded row per episode."""
     data = read_memmap(path)
     split = split_trajectories(data.to_tensordict(), trajectory_key="episode")
     shutil.rmtree(path)
@@ -363,13 +346,13 @@ def _split(path: Path) -> None:
 
 
 def _allocate(data: TensorDict, path: Path) -> TensorDict:
-    """Memory-mapped tensors like those of ``data``, on disk space that is theirs."""
+    """Memory-mapped tensors like those of ``data``, with their disk space reserved."""
     try:
         mapped = data.memmap_like(path)
-    except RuntimeError as error:  # how torch reports what the file system refuses
+    except RuntimeError as error:  # torch's error if the file system refuses
         raise OSError(str(error)) from error
-    # The maps are sparse files: on a full disk writing to them would kill the process instead of
-    # raising an error. macOS has no call for it.
+    # The maps are sparse files: on a full disk, writing to them would kill the process instead of
+    # raising an error. macOS cannot reserve space in this way.
     for file in path.rglob("*.memmap") if hasattr(os, "posix_fallocate") else ():
         if size := file.stat().st_size:
             with file.open("r+b") as handle:

@@ -1,4 +1,4 @@
-"""One episode as every format's reader returns it and every writer takes it, and its TensorDict."""
+"""The episode that all readers return and all writers take, and its TensorDict."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ RESERVED = frozenset(
         *("index", "mask"),
     )
 )
-"""Names that a part of the observation cannot have: TorchRL's layout uses them."""
+"""Names that TorchRL's layout uses and a part of the observation cannot have."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LeftOut:
-    """What a file has of an episode, and the episode that was read from it has not.
+    """The content of a file's episode that was not read.
 
     Attributes:
-        steps: at its end.
-        reward: their sum of rewards.
-        success: whether the only successful steps are among them.
-        arrays: names of what is not read, such as groups of another tool.
+        steps: number of steps left out at the end.
+        reward: sum of their rewards.
+        success: whether all successful steps are among them.
+        arrays: names of arrays and groups that are not read, such as those of other tools.
     """
 
     steps: int = 0
@@ -45,18 +45,18 @@ class LeftOut:
 class Episode:
     """One episode of T steps; row t of every array belongs to step t.
 
-    It ends with its last step: terminated there, or truncated if not.
+    The last step either terminates or is truncated.
 
     Attributes:
         observations: named parts before each action, ``(T, ...)`` each.
         next_observations: the same parts after it.
         actions: ``(T, action_dim)``.
         rewards: ``(T,)``.
-        terminated: ``(T,)`` bool; where no value follows. A horizon does not terminate.
+        terminated: ``(T,)`` bool; true if no value follows. A horizon does not terminate.
         extras: further arrays of T rows, such as ``successes`` (bool), ``phases`` and ``states``
             (the simulator's, before each action).
         attributes: numbers, strings and lists of strings, such as ``seed`` and ``model_file``.
-        left_out: what the file that it was read from has beyond that.
+        left_out: content of its file that was not read.
 
     Example:
         >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.zeros(5)
@@ -88,17 +88,13 @@ class Episode:
 
 
 def as_success(value: Any) -> bool | None:
-    """What an attribute ``success`` says, in any of the ways that tools write it.
+    """Interprets an attribute ``success`` in any of the forms that tools write.
 
     Args:
         value: a flag, its name, or a list of one of them.
 
     Returns:
-        ``None`` where it is neither 0 nor 1.
-
-    Example:
-        >>> as_success([1.0]), as_success("False"), as_success(2)
-        (True, False, None)
+        ``None`` for other values than 0 and 1.
     """
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
@@ -113,7 +109,7 @@ E = TypeVar("E")
 
 
 class LazyEpisodes(Mapping[str, E], Generic[E]):
-    """Episodes of a file by name, each read when it is asked for.
+    """Episodes of a file by name; each is read on access.
 
     Args:
         names: in the order of the file.
@@ -121,7 +117,7 @@ class LazyEpisodes(Mapping[str, E], Generic[E]):
     """
 
     def __init__(self, names: Iterable[str], read: Callable[[str], E]) -> None:
-        self._names = dict.fromkeys(names)  # in order, and found at once
+        self._names = dict.fromkeys(names)  # ordered, with fast lookup
         self._read = read
 
     def __getitem__(self, name: str) -> E:
@@ -137,10 +133,10 @@ class LazyEpisodes(Mapping[str, E], Generic[E]):
 
 
 def name_fault(name: str) -> str | None:
-    """Why a part of the observation cannot have a name; ``None`` if it can."""
+    """Message that explains why a part cannot have a name; ``None`` if it can."""
     if name in RESERVED:
         return f"valid: none of {sorted(RESERVED)}, which TorchRL's layout uses"
-    # Memory-mapped tensors have it for the name of their file, and it may come from a stranger.
+    # It becomes the name of a memory-mapped file, and may come from an untrusted source.
     length = len(name.encode(errors="surrogateescape"))
     if not 0 < length <= 240 or name.startswith(".") or "/" in name or "\\" in name:
         return "valid: a name without slashes that does not begin with a dot, of at most 240 bytes"
@@ -148,35 +144,21 @@ def name_fault(name: str) -> str | None:
 
 
 def as_tensordict(episode: Episode, *, number: int = 0) -> TensorDict:
-    """One episode in TorchRL's layout (TED).
+    """Converts one episode to TorchRL's layout (TED).
 
     Args:
-        episode: of T steps; its arrays are not copied where the dtype stays.
-        number: written to ``episode``.
+        episode: of T steps; arrays whose dtype stays are not copied.
+        number: of the episode, stored under ``episode``.
 
     Returns:
-        batch ``[T]``: the named parts of the observation and the same under ``"next"`` with the
-        dtypes that they have, ``action`` (float32 if it is floating-point), ``("next", "reward")``
-        (float32), ``("next", "done")``, ``("next", "terminated")``, ``("next", "truncated")`` and,
-        where the episode has ``successes``, ``("next", "success")``, each ``(T, 1)``; ``episode``
-        and ``step`` ``(T,)`` int64.
+        batch ``[T]``: the parts of the observation, also under ``"next"``, with their dtypes;
+        ``action`` (float32 if it is floating-point); ``("next", "reward")`` (float32),
+        ``("next", "done")``, ``("next", "terminated")``, ``("next", "truncated")`` and, if the
+        episode has ``successes``, ``("next", "success")``, each ``(T, 1)``; ``episode`` and
+        ``step`` ``(T,)`` int64.
 
     Raises:
-        BMRLError: if a part of the observation is named like one of TorchRL's keys, or like a path.
-
-    Example:
-        >>> part = np.zeros((5, 3))
-        >>> data = as_tensordict(
-        ...     Episode(
-        ...         observations={"x": part},
-        ...         next_observations={"x": part},
-        ...         actions=np.zeros((5, 2)),
-        ...         rewards=np.zeros(5),
-        ...         terminated=np.zeros(5, bool),
-        ...     )
-        ... )
-        >>> data["next", "truncated"].squeeze(-1).tolist()
-        [False, False, False, False, True]
+        BMRLError: for a part of the observation with an invalid name (:func:`name_fault`).
     """
     for name in episode.observations:
         if fault := name_fault(name):
@@ -210,7 +192,7 @@ def as_tensordict(episode: Episode, *, number: int = 0) -> TensorDict:
 
 
 def join_observations(path: Path, name: str, episode: Episode) -> dict[str, np.ndarray]:
-    """The observations of an episode as one sequence.
+    """Joins the observations of an episode to one sequence.
 
     Args:
         path: of the data set, for the message.
@@ -218,11 +200,11 @@ def join_observations(path: Path, name: str, episode: Episode) -> dict[str, np.n
         episode: of T steps, checked.
 
     Returns:
-        the named parts, ``(T + 1, ...)``: before each action and after the last.
+        the parts, ``(T + 1, ...)``: before each action and after the last.
 
     Raises:
-        DataError: if the observation after a step is not the one before the next step: naming
-            episode, part and row.
+        DataError: naming episode, part and row, if the observation after a step differs from the
+            one before the next step.
     """
     whole = {}
     for part, before in episode.observations.items():
@@ -232,26 +214,25 @@ def join_observations(path: Path, name: str, episode: Episode) -> dict[str, np.n
             raise DataError(
                 path,
                 f"{name}/next_obs/{part}",
-                f"row {row} differs from row {row + 1} of obs; valid: one sequence, which is all "
-                "that this format keeps",
+                f"row {row} differs from row {row + 1} of obs; valid: one sequence, because "
+                "this format stores each observation once",
             )
         whole[part] = np.concatenate([before, after[-1:]])
     return whole
 
 
 def stack_episodes(episodes: Iterable[Episode], *, task: int) -> TensorDict:
-    """Episodes one after the other, in TorchRL's layout.
+    """Concatenates episodes in TorchRL's layout.
 
     Args:
-        episodes: of equal parts and dtypes.
-        task: class index written to ``task``.
+        episodes: with equal parts and dtypes.
+        task: class index, stored under ``task``.
 
     Returns:
         batch ``[N]`` with the keys of :func:`as_tensordict` and ``task`` ``(N,)`` int64.
 
     Raises:
-        BMRLError: without episodes, or if a part of the observation is named like one of TorchRL's
-            keys, or like a path.
+        BMRLError: without episodes, or for a part of the observation with an invalid name.
 
     Example:
         >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.zeros(5)

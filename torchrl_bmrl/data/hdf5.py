@@ -1,45 +1,57 @@
-"""HDF5 files that may be damaged, or something else altogether."""
+"""Reads HDF5 files that may be damaged, and writes arrays and attributes with checksums."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from torchrl_bmrl.data.arrays import refuse_pointer
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.extras import needs
 
 with needs("data"):
     import h5py
 
+VERSION = ("v110", "v110")
+"""HDF5's structures to write: the default ones have no checksums, and "latest" could only be read
+by the version that wrote it."""
 DAMAGE = (OSError, RuntimeError, KeyError, TypeError, ValueError, MemoryError)
-"""What h5py raises on a damaged file, depending on where the damage is."""
+"""Errors that h5py raises on a damaged file, depending on where the damage is."""
 
 
 def open_file(path: str | Path) -> h5py.File:
     """Opens a file for reading.
 
     Raises:
-        DataError: if it is missing, no whole HDF5 file, or a git-LFS pointer to one.
+        DataError: if it is missing, not a complete HDF5 file, or a git-LFS pointer to one.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise DataError(path, None, "a folder; valid: a file" if path.is_dir() else "no such file")
     try:
-        with path.open("rb") as file:
-            pointer = file.read(23) == b"version https://git-lfs"
-        if not pointer:
-            return h5py.File(path, "r")
+        refuse_pointer(Path(path))
+        return h5py.File(path, "r")
+    except DataError:
+        raise
     except DAMAGE as error:
         if isinstance(error, BlockingIOError):  # HDF5's lock
             message = "in use: another process has it open for writing; valid: a closed file"
             raise DataError(path, None, message) from error
-        raise DataError(path, None, f"not a whole HDF5 file ({error})") from error
-    raise DataError(path, None, "a git-LFS pointer, not the data; `git lfs pull` fetches them")
+        raise DataError(path, None, f"not a complete HDF5 file ({error})") from error
+
+
+@contextmanager
+def _reading(path: str | Path, key: str, what: str = "") -> Iterator[None]:
+    """Turns what h5py raises on damage into an error that names file and key."""
+    try:
+        yield
+    except DataError:
+        raise
+    except DAMAGE as error:
+        raise DataError(path, key, f"{what}unreadable ({error})") from error
 
 
 def read_names(path: str | Path, file: h5py.File, key: str) -> list[str]:
@@ -48,40 +60,32 @@ def read_names(path: str | Path, file: h5py.File, key: str) -> list[str]:
     Raises:
         DataError: if there is no such group, or it cannot be read.
     """
-    try:
+    with _reading(path, key):
         group = _within(path, file, key)
         if isinstance(group, h5py.Group):
             return sorted(group, key=_natural)
-    except DataError:
-        raise
-    except DAMAGE as error:
-        raise DataError(path, key, f"unreadable ({error})") from error
     raise DataError(path, key, "missing; valid: a group" if group is None else "not a group")
 
 
 def read_node(path: str | Path, file: h5py.File, key: str) -> Any:
-    """A group or dataset; ``None`` where there is none, or a link to nowhere.
+    """A group or dataset; ``None`` if it is missing or a link to a missing node.
 
     Raises:
         DataError: if it cannot be read, or lies in another file.
     """
-    try:
+    with _reading(path, key):
         return _within(path, file, key)
-    except DataError:
-        raise
-    except DAMAGE as error:
-        raise DataError(path, key, f"unreadable ({error})") from error
 
 
 def _within(path: str | Path, file: h5py.File, key: str) -> Any:
-    """A node of a file, whose content is in that file and no larger than it can be.
+    """A node whose content lies in this file and is not larger than the file can hold.
 
     Raises:
-        DataError: if it is damaged, lies in another file, or claims more than compression makes of
-            this one.
+        DataError: if it is damaged, lies in another file, or claims more bytes than decompressing
+            this file can yield.
     """
     node = file.get(key)
-    # h5py has the same answer for what is not there and for what it cannot open.
+    # h5py returns the same for a missing node and for one that it cannot open.
     if node is None and isinstance(file.get(key, getlink=True), h5py.HardLink):
         raise DataError(path, key, "unreadable: it is there, and damaged")
     if node is not None and node.file.id != file.id:
@@ -89,14 +93,14 @@ def _within(path: str | Path, file: h5py.File, key: str) -> Any:
     if isinstance(node, h5py.Dataset):
         if node.external or node.is_virtual:
             raise DataError(path, key, "its content lies in other files; valid: in this file")
-        # gzip makes a thousandth of zeros, and nothing makes less.
+        # gzip compresses zeros to about a thousandth, and nothing to less.
         if node.nbytes > 2**20 + 1100 * os.path.getsize(path):
             raise DataError(path, key, f"claims {node.nbytes} bytes, more than the file can hold")
     return node
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    # Numbers by value, all else as text: (0, text) and (number, "") compare with each other.
+    # Numbers sort by value and the rest as text: (number, "") and (-1, text) can be compared.
     return [
         (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)
     ]
@@ -105,7 +109,7 @@ def _natural(name: str) -> list[tuple[int, str]]:
 def read_array(
     path: str | Path, file: h5py.File, key: str, rows: slice | None = None
 ) -> np.ndarray:
-    """The numbers of a dataset.
+    """Reads the numbers of a dataset.
 
     Args:
         path: of the file, for messages.
@@ -114,70 +118,78 @@ def read_array(
         rows: those to read; ``None`` for all.
 
     Raises:
-        DataError: if it is missing, a group, cannot be read, or holds anything but numbers.
+        DataError: if it is missing, a group, cannot be read, or has other content than numbers.
     """
-    try:
-        node = _within(path, file, key)
-        if isinstance(node, h5py.Dataset):
-            if node.dtype.kind not in "biuf":
-                raise DataError(path, key, f"dtype {node.dtype}; valid: numbers")
-            array = np.asarray(node[() if rows is None else rows])
-            return array.astype(array.dtype.newbyteorder("="), copy=False)  # as torch wants it
-    except DataError:
-        raise
-    except DAMAGE as error:
-        raise DataError(path, key, f"unreadable ({error})") from error
-    raise DataError(path, key, "missing" if node is None else "a group; valid: a dataset")
+    with _reading(path, key):
+        node = _dataset(path, file, key)
+        if node.dtype.kind not in "biuf":
+            raise DataError(path, key, f"dtype {node.dtype}; valid: numbers")
+        array = np.asarray(node[() if rows is None else rows])
+        return array.astype(array.dtype.newbyteorder("="), copy=False)  # as torch needs it
 
 
 def read_strings(path: str | Path, file: h5py.File, key: str) -> list[str]:
-    """The strings of a dataset, bytes or text.
+    """Reads the strings of a dataset, bytes or text.
 
     Raises:
         DataError: if it is missing, a group, or cannot be read.
     """
-    try:
-        node = _within(path, file, key)
-        if isinstance(node, h5py.Dataset):
-            return [_text(value) for value in np.asarray(node[()]).reshape(-1)]
-    except DataError:
-        raise
-    except DAMAGE as error:
-        raise DataError(path, key, f"unreadable ({error})") from error
-    raise DataError(path, key, "missing" if node is None else "a group; valid: a dataset")
+    with _reading(path, key):
+        node = _dataset(path, file, key)
+        return [_text(value) for value in np.asarray(node[()]).reshape(-1)]
+
+
+def _dataset(path: str | Path, file: h5py.File, key: str) -> h5py.Dataset:
+    node = _within(path, file, key)
+    if not isinstance(node, h5py.Dataset):
+        raise DataError(path, key, "missing" if node is None else "a group; valid: a dataset")
+    return node
 
 
 def read_attributes(path: str | Path, file: h5py.File, key: str) -> dict[str, Any]:
-    """Attributes of a group: text as ``str``, lists as lists, numbers as Python's.
+    """Attributes of a group: text as ``str``, arrays as lists, numbers as Python's.
 
     Raises:
         DataError: if they cannot be read.
     """
-    try:
+    with _reading(path, key, "attributes "):
         return {name: _plain(value) for name, value in file[key].attrs.items()}
-    except DAMAGE as error:
-        raise DataError(path, key, f"attributes unreadable ({error})") from error
 
 
 def read_attribute(path: str | Path, file: h5py.File, key: str, name: str) -> Any:
-    """One attribute of a group, as :func:`read_attributes` gives it; ``None`` without it.
+    """One attribute of a group, converted as by :func:`read_attributes`; ``None`` if missing.
 
     Raises:
         DataError: if it cannot be read.
     """
-    try:
+    with _reading(path, key, f"attribute {name} "):
         return _plain(file[key].attrs.get(name))
-    except DAMAGE as error:
-        raise DataError(path, key, f"attribute {name} unreadable ({error})") from error
+
+
+def has_rows(node: Any, *counts: int) -> bool:
+    """Whether a node is an array of numbers with one of these numbers of rows."""
+    if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "biuf":
+        return False
+    return bool(node.ndim and node.size) and node.shape[0] in counts
+
+
+def write_array(group: h5py.Group, key: str, array: np.ndarray, **options: Any) -> None:
+    """Writes a compressed array with checksums.
+
+    The checksum of zeros is zero, so a hole in a file would pass for data; compressed zeros differ
+    from a hole. An array without elements has no chunks, which checksums and filters need.
+    """
+    filters = {"compression": "gzip", "compression_opts": 1, "fletcher32": True, **options}
+    group.create_dataset(key, data=array, **(filters if array.size else {}))
 
 
 def write_attributes(group: h5py.Group, attributes: Mapping[str, Any]) -> None:
-    """Writes numbers, texts and lists of them, so that damage is found when they are read."""
+    """Writes numbers, texts and lists of them so that damage is detected when they are read."""
     for name, value in attributes.items():
         texts = [value] if isinstance(value, str) else value
         if isinstance(texts, list | tuple) and all(isinstance(text, str) for text in texts):
-            # Texts of a fixed length lie in the group's header, which has a checksum. h5py's own of
-            # variable length lie in a heap that has none, and damaged may have HDF5 loop for ever.
+            # Texts of fixed length lie in the group's header, which has a checksum. h5py's texts of
+            # variable length lie in a heap without one; if damaged, HDF5 may loop forever.
             encoded = [text.encode() for text in texts]
             length = max([1, *map(len, encoded)])
             array = np.array(encoded if texts is value else encoded[0], dtype=f"S{length}")

@@ -14,11 +14,10 @@ import numpy as np
 from torchrl_bmrl.data import robomimic
 from torchrl_bmrl.data.convert import Conversion, Stream, writing
 from torchrl_bmrl.data.episodes import Episode
-from torchrl_bmrl.data.options import Bounds, ReadOptions, check_bounds
+from torchrl_bmrl.data.options import Bounds, ReadOptions, check_bounds, join_bounds
 from torchrl_bmrl.data.robomimic_file import MASKS
 from torchrl_bmrl.data.sources import (
     Source,
-    join_bounds,
     open_sources,
     range_of_actions,
     with_bounds,
@@ -57,7 +56,7 @@ def import_demonstrations(
             list of such paths. Several become one.
         target: the new HDF5 file.
         options: how the source is read; the defaults if ``None``.
-        task: whose scene a robosuite ``demo.hdf5`` was recorded in.
+        task: the task in whose scene a robosuite ``demo.hdf5`` was recorded.
         tracking: see :func:`torchrl_bmrl.data.robosuite.open_episodes`.
         valid_share: share of the episodes to hold out, of which there is at least one.
         bounds: lowest and highest action, which become -1 and 1; those of
@@ -144,7 +143,7 @@ def find_action_bounds(
 
     They are those of ``options.bounds``, else those that the file states, else [-1, 1] if all
     actions lie in that range, else each dimension's smallest and largest action. Several sources
-    have the bounds that contain those of each. :func:`~torchrl_bmrl.data.sources.join_bounds`
+    have the bounds that contain those of each. :func:`~torchrl_bmrl.data.options.join_bounds`
     joins the bounds of several tasks.
 
     Args:
@@ -159,6 +158,23 @@ def find_action_bounds(
     Raises:
         ConfigError: for invalid options, and for sources with different numbers of actions.
         DataError: for missing or damaged files, and for discrete actions.
+
+    Example:
+        >>> import tempfile
+        >>> x, r = {"x": np.zeros((2, 3))}, np.zeros(2)
+        >>> episode = Episode(
+        ...     observations=x,
+        ...     next_observations=x,
+        ...     actions=np.array([[-2.0, 1.0], [3.0, 4.0]]),
+        ...     rewards=r,
+        ...     terminated=r > 0,
+        ... )
+        >>> path = Path(tempfile.mkdtemp()) / "own.hdf5"
+        >>> robomimic.write_episodes(path, [episode], env_args={}, bounds=(-4, 4))
+        >>> find_action_bounds(path)
+        (-4.0, 4.0)
+        >>> find_action_bounds(path, options=ReadOptions(bounds="data"))
+        ((-2.0, 1.0), (3.0, 4.0))
     """
     reading = vars(options or ReadOptions())
     with open_sources(_expand(source), task=task, tracking=tracking, **reading) as sources:
@@ -169,11 +185,30 @@ def find_action_bounds(
 def read_original_bounds(path: str | Path) -> Bounds | None:
     """The bounds that the actions of an imported file had before they were scaled to [-1, 1].
 
+    Args:
+        path: the file.
+
     Returns:
         lowest and highest action; ``None`` if the file was not imported.
 
     Raises:
         DataError: if the file is missing or damaged, or states them in another form.
+
+    Example:
+        >>> import tempfile
+        >>> x, r = {"x": np.zeros((2, 3))}, np.zeros(2)
+        >>> episode = Episode(
+        ...     observations=x,
+        ...     next_observations=x,
+        ...     actions=np.zeros((2, 1)),
+        ...     rewards=r,
+        ...     terminated=r > 0,
+        ... )
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> robomimic.write_episodes(folder / "own.hdf5", [episode] * 2, env_args={})
+        >>> _ = import_demonstrations(folder / "own.hdf5", folder / "run.hdf5", bounds=(-2, 2))
+        >>> read_original_bounds(folder / "run.hdf5"), read_original_bounds(folder / "own.hdf5")
+        ((-2.0, 2.0), None)
     """
     return _parse(path, robomimic.read_metadata(path).get(ORIGINAL_BOUNDS))
 

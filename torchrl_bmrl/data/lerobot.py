@@ -1,4 +1,4 @@
-"""Data sets in LeRobot's v3.0 layout, for training with LeRobot, and from it.
+"""Writes data sets in LeRobot's v3.0 layout.
 
 Layout of a data set's folder::
 
@@ -8,8 +8,8 @@ Layout of a data set's folder::
     meta/tasks.parquet                         the task's text and its index
     meta/episodes/chunk-000/file-000.parquet   a row for each episode, its statistics among them
 
-The layout has no row for the observation after the last step, and everything but indices and flags
-is float32: what is written does not come back whole. Minari's layout keeps it. Reading is in
+The layout loses the observation after the last step, and the precision of float64: only indices and
+flags are not float32. Minari's layout loses neither. The module to read it is
 :mod:`torchrl_bmrl.data.lerobot_reader`.
 """
 
@@ -30,7 +30,7 @@ from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import new_folder
 
 FILE_SIZE = 100
-"""Size of a data file [MiB] at which the next one begins: LeRobot's own."""
+"""Size of a data file [MiB] after which the next one begins, as in LeRobot."""
 FILES_PER_CHUNK = 1000
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
@@ -42,26 +42,24 @@ def write_episodes(
     *,
     fps: float,
     task: str,
-    robot_type: str | None = None,
 ) -> None:
-    """Writes a whole data set, or none.
+    """Writes a whole data set, or nothing.
 
     ``LeRobotDataset(repo_id, root=path)`` reads it. The columns, each with T rows for an episode:
     ``observation.state`` (the parts in their order, one after the other), ``action``,
     ``next.reward``, ``next.done`` (the last step), ``next.terminated``, ``next.success`` where
     there are ``successes``, ``timestamp`` [s] and the indices. Other extras and the attributes
-    are left out.
+    are not written.
 
     Args:
         path: the new folder.
         episodes: of equal parts, shapes and dtypes, consumed one at a time.
         fps: steps per second [Hz].
         task: what the robot does, in words.
-        robot_type: such as ``"sawyer"``.
 
     Raises:
-        DataError: if the folder exists, without episodes, and for an episode that cannot be kept:
-            naming episode, key and row. Images are not exported.
+        DataError: if the folder exists, without episodes, and, naming episode, key and row, for an
+            episode that cannot be stored. Images are not exported.
         ConfigError: if ``fps`` is not positive or ``task`` is empty.
         MissingExtraError: if pyarrow is not installed.
     """
@@ -90,7 +88,7 @@ def write_episodes(
         _write_meta(folder / "meta", rows, task)
         info = {
             "codebase_version": "v3.0",
-            "robot_type": robot_type,
+            "robot_type": None,
             "total_episodes": len(rows),
             "total_frames": rows[-1]["dataset_to_index"],
             "total_tasks": 1,
@@ -109,13 +107,13 @@ def write_episodes(
 def describe_losses(
     *, extras: Iterable[str], attributes: Iterable[str], rounded: bool, whole_numbers: bool
 ) -> Iterator[str]:
-    """What :func:`write_episodes` has no place for, in words.
+    """Describes what :func:`write_episodes` cannot store.
 
     Args:
         extras: names of the episodes' extras.
         attributes: names of their attributes.
         rounded: whether some numbers have more than 32 bits.
-        whole_numbers: whether actions, rewards or observations have some.
+        whole_numbers: whether actions, rewards or observations are integers.
     """
     dropped = [*(name for name in extras if name != "successes"), *attributes]
     named = f"; {', '.join(dropped)}" if dropped else ""
@@ -127,7 +125,7 @@ def describe_losses(
 
 
 def _columns(path: Path, name: str, episode: Episode) -> dict[str, np.ndarray]:
-    """The columns that come from an episode, ``(T, n)``, or ``(T,)`` where n is 1."""
+    """Columns of an episode's data, ``(T, n)``, or ``(T,)`` if n is 1."""
     join_observations(path, name, episode)
     for key, array in {"actions": episode.actions, **episode.observations}.items():
         if array.ndim > 2:
@@ -141,7 +139,7 @@ def _columns(path: Path, name: str, episode: Episode) -> dict[str, np.ndarray]:
         "action": episode.actions.reshape(steps, -1).astype(np.float32),
         "next.reward": episode.rewards.astype(np.float32),
         "next.done": np.arange(steps) == steps - 1,
-        # A feature of its own, which LeRobot loads; next.done says nothing of the value after it.
+        # LeRobot loads it, too. next.done does not tell whether a value follows.
         "next.terminated": episode.terminated.astype(bool),
     }
     if "successes" in episode.extras:
@@ -150,7 +148,7 @@ def _columns(path: Path, name: str, episode: Episode) -> dict[str, np.ndarray]:
         if not (finite := np.isfinite(column)).all():
             row = int(np.argwhere(~finite)[0][0])
             raise DataError(path, f"{name}/{key}", f"row {row} is too large for float32")
-    # LeRobot has no list of one number.
+    # LeRobot has no lists of one number.
     return {key: x[:, 0] if x.shape[1:] == (1,) else x for key, x in columns.items()}
 
 
@@ -190,7 +188,7 @@ def _names(parts: Mapping[str, np.ndarray]) -> list[str]:
 
 
 class _Frames:
-    """The data files; the next one begins once one has reached LeRobot's limit of size."""
+    """Writer of the data files, which starts a new one at LeRobot's size limit."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -257,7 +255,7 @@ def _row(
 
 
 def _statistics(array: np.ndarray) -> dict[str, np.ndarray]:
-    """LeRobot's statistics, each ``(n,)``; quantiles exactly, where LeRobot uses histograms."""
+    """LeRobot's statistics, each ``(n,)``, with exact quantiles instead of histograms."""
     rows = array.reshape(len(array), -1)
     exact = rows.astype(np.float64)
     return {
@@ -271,7 +269,7 @@ def _statistics(array: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _total(rows: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Statistics of all episodes from theirs; LeRobot's quantiles are averages of quantiles."""
+    """Statistics over all episodes, from those of each; like LeRobot, it averages quantiles."""
     total: dict[str, dict[str, Any]] = {}
     for key in (key for key in rows[0] if key.startswith("stats/")):
         _, feature, name = key.split("/")
@@ -301,7 +299,7 @@ def _write_meta(meta: Path, rows: list[dict[str, Any]], task: str) -> None:
     path.parent.mkdir(parents=True)
     write_table(pa.Table.from_pylist(rows), path, write_page_checksum=True)
     _write_json(meta / "stats.json", _total(rows))
-    # The text is the index of a data frame: LeRobot reads the table with pandas.
+    # LeRobot reads the table with pandas, with the text as the index of the data frame.
     types = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}
     pandas = {
         "index_columns": ["task"],

@@ -1,4 +1,4 @@
-"""What the folder ``meta`` of a LeRobot data set says: where each episode lies."""
+"""Reads the folder ``meta`` of a LeRobot data set, which states where each episode lies."""
 
 from __future__ import annotations
 
@@ -10,18 +10,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torchrl_bmrl.data.arrays import refuse_pointer
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import read_json
 
 _OLD, _NEW = ("v2.0", "v2.1"), ("v3.0",)
 _OLD_FILE = "data/chunk-{chunk:03d}/episode_{episode:06d}.parquet"
+_PLACE = ("data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index")
 _NEW_FILE = "data/chunk-{chunk:03d}/file-{file:03d}.parquet"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """Where an episode lies: its file, its first row there, its rows, and its place in the set."""
+    """Position of an episode: its file, first row in it, number of rows, and first index."""
 
     file: str
     start: int
@@ -32,13 +34,13 @@ class Rows:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """What the folder ``meta`` says of a data set.
+    """The content of the folder ``meta``.
 
     Attributes:
         path: the data set's folder.
         info: content of ``info.json``.
-        episodes: where each episode lies, by name.
-        steps: rows of each data file.
+        episodes: position of each episode, by name.
+        steps: number of rows of each data file.
     """
 
     path: Path
@@ -51,8 +53,8 @@ class Layout:
         """Reads and checks the folder ``meta``.
 
         Raises:
-            DataError: naming file and row, for a version that is not read, episodes whose rows do
-                not follow one another, and data files that no episode lies in.
+            DataError: naming file and row, for an unknown version, episodes whose rows do not
+                follow one another, and data files that belong to no episode.
         """
         path = Path(path)
         info = _read_info(path)
@@ -71,15 +73,7 @@ class Layout:
                 message = f"{where}: episode_index {number}, length {count}; valid: {i}, 1 or more"
                 raise DataError(path, "meta/episodes", message)
             if new:
-                chunk, file, begin, end = (
-                    _whole(path, row, key, where)
-                    for key in (
-                        "data/chunk_index",
-                        "data/file_index",
-                        "dataset_from_index",
-                        "dataset_to_index",
-                    )
-                )
+                chunk, file, begin, end = (_whole(path, row, key, where) for key in _PLACE)
                 if (begin, end) != (start, start + count):
                     message = f"{where}: rows {begin} to {end}; valid: {start} to {start + count}"
                     raise DataError(path, "meta/episodes", message)
@@ -104,13 +98,13 @@ class Layout:
         for stray in sorted((path / "data").rglob("*.parquet")):
             # LeRobot would read its steps, too.
             if str(stray.relative_to(path).as_posix()) not in steps_of_file:
-                raise DataError(stray, None, "in no episode; valid: a file that meta tells of")
+                raise DataError(stray, None, "in no episode; valid: a file that meta lists")
         return cls(path=path, info=info, episodes=rows, steps=steps_of_file)
 
 
 def _read_info(path: Path) -> dict[str, Any]:
     file = path / "meta" / "info.json"
-    _refuse_pointer(file)
+    refuse_pointer(file)
     info = read_json(file, "LeRobot's description of a data set")
     if not isinstance(info, dict):
         raise DataError(file, None, f"{type(info).__name__}; valid: a JSON object")
@@ -121,21 +115,12 @@ def _read_info(path: Path) -> dict[str, Any]:
     if not isinstance(info.get("features"), dict):
         raise DataError(file, "features", "missing; valid: a JSON object")
     fps, chunks_size = info.get("fps"), info.get("chunks_size", 1000)
-    # bool is an int in Python; a larger number is no rate, and may be no float.
+    # bool is an int in Python. Larger numbers are not rates, and may not fit a float.
     if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 < fps < 1e9:
         raise DataError(file, "fps", f"{fps!r}; valid: a positive number")
     if not isinstance(chunks_size, int) or isinstance(chunks_size, bool) or chunks_size < 1:
         raise DataError(file, "chunks_size", f"{chunks_size!r}; valid: 1 or more")
     return info
-
-
-def _refuse_pointer(file: Path) -> None:
-    if not file.is_file():
-        raise DataError(file, None, "no such file")
-    with file.open("rb") as stream:
-        if stream.read(23) == b"version https://git-lfs":
-            message = "a git-LFS pointer, not the data; `git lfs pull` fetches them"
-            raise DataError(file, None, message)
 
 
 def _whole(path: Path, row: Mapping[str, Any], key: str, where: str) -> int:
@@ -148,19 +133,19 @@ def _whole(path: Path, row: Mapping[str, Any], key: str, where: str) -> int:
 
 def _read_lines(path: Path, name: str) -> list[dict[str, Any]]:
     file = path / "meta" / f"{name}.jsonl"
-    _refuse_pointer(file)
+    refuse_pointer(file)
     rows = []
     try:
-        # Not splitlines: a text may hold other ends of lines, such as U+2028.
+        # Not splitlines: texts may contain other line ends, such as U+2028.
         lines = file.read_text(encoding="utf-8").split("\n")
-        for number, line in enumerate(lines, 1):  # no other ends
+        for number, line in enumerate(lines, 1):
             row = json.loads(line) if line.strip() else None
             if not isinstance(row, dict | None):
                 raise DataError(file, f"line {number}", "valid: a JSON object")
             rows += [] if row is None else [row]
+    except DataError:
+        raise
     except (OSError, ValueError, RecursionError) as error:
-        if isinstance(error, DataError):
-            raise
         raise DataError(file, None, f"not JSON, a line for each episode ({error})") from error
     return rows
 
@@ -191,8 +176,8 @@ def _order(row: Mapping[str, Any]) -> int:
 
 @contextmanager
 def open_parquet(file: Path) -> Iterator[Any]:
-    """A parquet file; whatever pyarrow raises inside becomes a DataError."""
-    _refuse_pointer(file)
+    """Opens a parquet file; errors of pyarrow inside the block become a DataError."""
+    refuse_pointer(file)
     with needs("data"):
         import pyarrow as pa
         from pyarrow.parquet import ParquetFile

@@ -1,14 +1,13 @@
-"""The reading half of :mod:`torchrl_bmrl.data.lerobot`: layouts v2.0, v2.1 and v3.0.
+"""Reads LeRobot data sets of the layouts v2.0, v2.1 and v3.0.
 
-What older versions have otherwise::
+:mod:`torchrl_bmrl.data.lerobot` describes and writes v3.0. The older layouts differ in::
 
     data/chunk-000/episode_000000.parquet      a file for each episode
     meta/episodes.jsonl                        a line for each episode
     meta/tasks.jsonl                           a line for each task
 
-Pages of parquet files may carry checksums, as those do that this library writes; where they do, a
-flipped bit is found. Images and videos are left alone, and what is after the last step is not in
-the layout.
+Pages of parquet files may have checksums, as those written by this library do; then flipped bits
+are detected. Images and videos are not read. The layout has no observation after the last step.
 """
 
 from __future__ import annotations
@@ -22,98 +21,82 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_bmrl.data.arrays import as_flags, check_finite
+from torchrl_bmrl.data.arrays import as_column, as_flags, check_finite
 from torchrl_bmrl.data.episodes import LazyEpisodes
 from torchrl_bmrl.data.lerobot_meta import Layout, Rows, open_parquet
-from torchrl_bmrl.data.raw import RawEpisode
+from torchrl_bmrl.data.raw import Opened, RawEpisode
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.extras import needs
 
 _INDICES = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _STEPS = ("next.reward", "next.done", "next.success", "next.terminated")
 _SLACK = 1e-3
-"""By how much a step's timestamp may be off, as a share of the time since the first: float32."""
+"""Tolerance of a timestamp, relative to the time since the first one (they are float32)."""
 
 
 @contextmanager
-def open_raw(path: str | os.PathLike[str]) -> Iterator[Mapping[str, RawEpisode]]:
-    """Opens a data set; an episode is read when it is asked for.
+def open_data(path: str | os.PathLike[str]) -> Iterator[Opened]:
+    """Opens a data set; each episode is read on access.
 
-    Every column ``observation.<part>`` of numbers is a part. Where the features name each number
-    ``<part>.<i>``, as this library writes ``observation.state``, those are the parts. ``action``,
-    ``next.reward``, ``next.done``, ``next.terminated`` and ``next.success`` become actions,
-    rewards, dones, terminations and the extra ``successes``; other columns of numbers are extras,
-    and the task's text is the attribute ``task``. Images, videos and texts are named in
-    ``left_alone``.
+    Every column ``observation.<part>`` of numbers is a part of the observation. If the features
+    name each number ``<part>.<i>``, as this library writes ``observation.state``, those are the
+    parts. ``action``, ``next.reward``, ``next.done``, ``next.terminated`` and ``next.success``
+    become actions, rewards, dones, terminations and the extra ``successes``; other columns of
+    numbers are extras, and the task's text is the attribute ``task``. Images, videos and texts are
+    not read, but listed in ``left_alone``.
 
     Args:
-        path: the data set's folder, which holds ``meta/info.json``.
+        path: the data set's folder, which contains ``meta/info.json``.
 
     Yields:
-        the episodes as ``episode_0``, ``episode_1``, ...; to be read inside the block.
+        the episodes as ``episode_0``, ``episode_1``, ...; the metadata ``dataset_id``, ``fps``,
+        ``robot_type`` and, if all episodes have the same, ``task``; and oddities.
 
     Raises:
-        DataError: naming file, column and row, for a file that is missing, damaged or a git-LFS
-            pointer, another version of the layout, and indices that contradict each other. What
-            concerns one episode is raised when that is read.
+        DataError: naming file, column and row, for a missing or damaged file, a git-LFS pointer, an
+            unknown version of the layout, and indices that contradict each other. Faults of one
+            episode are raised when it is read.
         MissingExtraError: if pyarrow is not installed.
     """
     layout = Layout.of(path)
     tables = _Tables(layout)
+    metadata = {"dataset_id": layout.path.resolve().name, "fps": float(layout.info["fps"])}
+    if isinstance(robot := layout.info.get("robot_type"), str):
+        metadata["robot_type"] = robot
+    tasks = {rows.task for rows in layout.episodes.values()}
+    if len(tasks) == 1 and (task := tasks.pop()):
+        metadata["task"] = task
 
     def read(name: str) -> RawEpisode:
         return _read_episode(layout, name, tables)
 
-    yield LazyEpisodes(layout.episodes, read)
+    yield Opened(
+        episodes=LazyEpisodes(layout.episodes, read),
+        metadata=metadata,
+        oddities=list(_oddities(layout)),
+    )
 
 
-def read_metadata(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a data set says about itself: ``dataset_id``, ``fps``, ``robot_type``, its one ``task``.
-
-    Raises:
-        DataError: as :func:`open_raw`.
-    """
-    layout = Layout.of(path)
-    told: dict[str, Any] = {"dataset_id": layout.path.resolve().name}
-    fps = layout.info.get("fps")
-    if isinstance(fps, int | float) and not isinstance(fps, bool) and 0 < fps < float("inf"):
-        told["fps"] = float(fps)
-    if isinstance(robot := layout.info.get("robot_type"), str):
-        told["robot_type"] = robot
-    tasks = {rows.task for rows in layout.episodes.values()}
-    if len(tasks) == 1 and (task := tasks.pop()):
-        told["task"] = task
-    return told
-
-
-def find_oddities(path: str | os.PathLike[str]) -> list[str]:
-    """What deserves a look in a data set beside its episodes: warnings.
-
-    Raises:
-        DataError: as :func:`open_raw`.
-    """
-    layout = Layout.of(path)
-    oddities = []
+def _oddities(layout: Layout) -> Iterator[str]:
     steps = sum(rows.count for rows in layout.episodes.values())
     for key, found in (("total_episodes", len(layout.episodes)), ("total_frames", steps)):
         said = layout.info.get(key)
         if said is not None and said != found:
-            oddities.append(f"meta/info.json: {key} says {said}, there are {found}")
+            yield f"meta/info.json: {key} is {said}, but there are {found}"
     videos = [
         key
         for key, feature in layout.info["features"].items()
         if isinstance(feature, dict) and feature.get("dtype") in ("video", "image")
     ]
     if videos:
-        oddities.append(f"left alone, as pictures: {', '.join(videos)}")
-    return oddities
+        yield f"pictures are not read: {', '.join(videos)}"
 
 
 # -- data ------------------------------------------------------------------------------------------
 
 
 class _Tables:
-    """Numbers of one data file at a time: neighbouring episodes share it."""
+    """Cache of one data file's columns of numbers, because neighbouring episodes share a file."""
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
@@ -122,7 +105,7 @@ class _Tables:
         self.left_alone: list[str] = []
 
     def read(self, name: str) -> Any:
-        """The columns of numbers of a data file."""
+        """Reads the columns of numbers of a data file."""
         if name != self.name:
             with open_parquet(self.layout.path / name) as parquet:
                 fields = {field.name: field.type for field in parquet.schema_arrow}
@@ -144,13 +127,13 @@ class _Tables:
         for key, feature in self.layout.info["features"].items():
             told = feature.get("dtype") if isinstance(feature, dict) else None
             if told != "video" and key not in fields:
-                raise DataError(file, key, "missing, but meta/info.json tells of it")
+                raise DataError(file, key, "missing, but meta/info.json lists it")
 
 
 def _holds_numbers(kind: Any) -> bool:
     with needs("data"):
         import pyarrow as pa
-    # datasets' arrays of several dimensions, once that package is imported.
+    # The package datasets registers its own type for arrays of several dimensions.
     kind = kind.storage_type if isinstance(kind, pa.BaseExtensionType) else kind
     while (
         pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
@@ -169,20 +152,16 @@ def _read_episode(layout: Layout, name: str, tables: _Tables) -> RawEpisode:
     _check_indices(layout, file, arrays, rows, number)
     if "action" not in arrays:
         raise DataError(file, "action", "missing; valid: numbers, a row for each step")
-    steps = {
-        key: _one_number(file, key, arrays[key], rows.start) for key in _STEPS if key in arrays
-    }
+    steps = {key: as_column(file, key, arrays[key]) for key in _STEPS if key in arrays}
     for key, array in arrays.items():
         if key.startswith("observation."):
             check_finite(file, key, array, rows.start)
     observations = _parts(layout, arrays)
-    known = {
-        "action",
-        *_INDICES,
-        *_STEPS,
-        *(key for key in arrays if key.startswith("observation.")),
+    extras = {
+        key: array
+        for key, array in arrays.items()
+        if key not in ("action", *_INDICES, *_STEPS) and not key.startswith("observation.")
     }
-    extras = {key: array for key, array in arrays.items() if key not in known}
     flags = {
         key: as_flags(file, key, steps[key], rows.start)
         for key in ("next.done", "next.success", "next.terminated")
@@ -203,7 +182,7 @@ def _read_episode(layout: Layout, name: str, tables: _Tables) -> RawEpisode:
 
 
 def _array(file: Path, key: str, column: Any, start: int) -> np.ndarray:
-    """A column of numbers, or of lists of them of one length, as ``(T, ...)``."""
+    """A column of numbers, or of lists of equal lengths, as an array ``(T, ...)``."""
     with needs("data"):
         import pyarrow as pa
         import pyarrow.compute as pc
@@ -227,14 +206,14 @@ def _array(file: Path, key: str, column: Any, start: int) -> np.ndarray:
             raise DataError(file, key, message)
         shape.append(int(sizes[0]))
         array = array.flatten()
-    # A copy: pyarrow's memory is read only, and the file's other episodes lie beside it.
+    # A copy: pyarrow's memory is read-only and shared with the file's other episodes.
     return array.to_numpy(zero_copy_only=False).reshape(shape).copy()
 
 
 def _check_indices(
     layout: Layout, file: Path, arrays: Mapping[str, np.ndarray], rows: Rows, number: int
 ) -> None:
-    """Compares the indices of an episode's rows with where it is said to lie."""
+    """Compares the indices of an episode's rows with its position in ``meta``."""
     frames = np.arange(rows.count)
     valid = {
         "episode_index": np.full(rows.count, number),
@@ -244,26 +223,19 @@ def _check_indices(
     for key, expected in valid.items():
         if key not in arrays:
             raise DataError(file, key, "missing; valid: a number for each row")
-        found = _one_number(file, key, arrays[key], rows.start)
+        found = as_column(file, key, arrays[key])
         if len(wrong := np.flatnonzero(found != expected)):
             message = (
                 f"{found[wrong[0]]} in row {rows.start + wrong[0]}; valid: {expected[wrong[0]]}"
             )
             raise DataError(file, key, message)
-    fps = layout.info.get("fps")
-    if "timestamp" in arrays and isinstance(fps, int | float) and 0 < fps < float("inf"):
-        times = _one_number(file, "timestamp", arrays["timestamp"], rows.start)
+    fps = layout.info["fps"]
+    if "timestamp" in arrays:
+        times = as_column(file, "timestamp", arrays["timestamp"])
         off = np.abs((times.astype(np.float64) - times[0]) * fps - frames)
         if len(wrong := np.flatnonzero(~(off <= _SLACK * (1 + frames)))):
-            message = f"{times[wrong[0]]} in row {rows.start + wrong[0]} does not fit {fps} steps"
+            message = f"{times[wrong[0]]} in row {rows.start + wrong[0]} does not match {fps} steps"
             raise DataError(file, "timestamp", f"{message} a second; valid: evenly spaced")
-
-
-def _one_number(file: Path, key: str, array: np.ndarray, start: int) -> np.ndarray:
-    if array.shape[1:] not in ((), (1,)):
-        message = f"{array.shape[1:]} numbers in row {start}; valid: one for each row"
-        raise DataError(file, key, message)
-    return array.reshape(-1)
 
 
 def _column(array: np.ndarray) -> np.ndarray:
@@ -271,7 +243,7 @@ def _column(array: np.ndarray) -> np.ndarray:
 
 
 def _parts(layout: Layout, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Parts of the observation: a column each, or as the features name its numbers."""
+    """Parts of the observation: one for each column, or as the features name its numbers."""
     parts: dict[str, np.ndarray] = {}
     for key, array in arrays.items():
         if not key.startswith("observation."):
@@ -292,7 +264,7 @@ def _parts(layout: Layout, arrays: Mapping[str, np.ndarray]) -> dict[str, np.nda
 
 
 def _split(names: Any) -> dict[str, list[int]]:
-    """Columns by part, where each is named ``<part>.<i>``, i from 0, or after a part of one."""
+    """Columns by part, if each is named ``<part>.<i>``, i from 0, or ``<part>`` if it is alone."""
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         return {}
     parts: dict[str, list[int]] = {}

@@ -14,12 +14,11 @@ Layout of the folder ``<namespace>/<name>-v<number>``::
             infos/<extra>          (T + 1, ...) row t before step t; the last row is repeated
 
 Minari compresses uint8 images to JPEG, which loses bits and which TorchRL cannot read. Images are
-therefore kept as they are and declared as boxes of int32, which no reader takes for JPEG.
+therefore stored unchanged and declared as boxes of int32, which no reader mistakes for JPEG.
 
-Version 0.5.3 of Minari (neither 0.5.2 nor 0.5.4) compresses every array of uint8 with two or three
-dimensions, small images and plain vectors among them, and returns the bytes of the JPEG where the
-space is no image. :func:`open_raw` finds them by their first bytes and decodes what has the space's
-shape.
+Minari 0.5.3 (but neither 0.5.2 nor 0.5.4) compresses every uint8 array of two or three dimensions,
+including small images and plain vectors, and returns the bytes of the JPEG if the space is not an
+image. The reader recognises them by their first bytes and decodes those of the space's shape.
 """
 
 from __future__ import annotations
@@ -34,14 +33,8 @@ from typing import Any
 import numpy as np
 
 from torchrl_bmrl.data.episodes import Episode, join_observations
-from torchrl_bmrl.data.hdf5 import DAMAGE, write_attributes
-from torchrl_bmrl.data.minari_reader import (
-    OWN_ATTRIBUTES,
-    find_oddities,
-    open_episodes,
-    open_raw,
-    read_metadata,
-)
+from torchrl_bmrl.data.hdf5 import DAMAGE, VERSION, write_array, write_attributes
+from torchrl_bmrl.data.minari_reader import OWN_ATTRIBUTES, open_data
 from torchrl_bmrl.data.options import Bounds, check_bounds
 from torchrl_bmrl.data.schema import check_episode, check_fps, layout_of
 from torchrl_bmrl.errors import DataError
@@ -53,7 +46,7 @@ with needs("data"):
 
 _UNBOUNDED = (-np.inf, np.inf)
 
-__all__ = ["find_oddities", "open_episodes", "open_raw", "read_metadata", "write_episodes"]
+__all__ = ["open_data", "write_episodes"]
 
 
 def write_episodes(
@@ -64,27 +57,27 @@ def write_episodes(
     description: str = "",
     bounds: Bounds | None = None,
 ) -> None:
-    """Writes a whole data set, or none.
+    """Writes a whole data set, or nothing.
 
-    ``minari.load_dataset("<namespace>/<name>-v<number>")`` reads it where ``MINARI_DATASETS_PATH``
-    is the folder that holds the namespace. So does TorchRL's ``MinariExperienceReplay`` with
-    ``load_from_local_minari=True``, but version 0.14.1 has two faults of its own: it shows any
-    Minari data set as zeros (it stores what it read with ``memmap_like``, which keeps shapes
-    alone), and it fails on a single episode. :func:`open_episodes` has neither.
+    ``minari.load_dataset("<namespace>/<name>-v<number>")`` reads it if ``MINARI_DATASETS_PATH`` is
+    the folder of the namespace. TorchRL's ``MinariExperienceReplay`` reads it with
+    ``load_from_local_minari=True``, but its version 0.14.1 shows every Minari data set as zeros
+    (it stores the data with ``memmap_like``, which only copies shapes) and fails on a single
+    episode.
 
-    Every array keeps its dtype and carries checksums, and so do names and shapes.
+    Every array keeps its dtype. Arrays, names and shapes have checksums.
 
     Args:
-        path: the new folder ``<namespace>/<name>-v<number>``; both names make the data set's id.
+        path: the new folder ``<namespace>/<name>-v<number>``; both names form the data set's id.
         episodes: of equal parts, shapes and dtypes, consumed one at a time.
-        fps: steps per second [Hz], kept in ``metadata.json``.
-        description: kept in ``metadata.json``.
-        bounds: of floating-point actions, which become their space; ``None`` for a space without.
+        fps: steps per second [Hz], stored in ``metadata.json``.
+        description: stored in ``metadata.json``.
+        bounds: of floating-point actions, stored as their space; ``None`` for an unbounded space.
 
     Raises:
-        DataError: if the folder exists or its name is no id of Minari's, without episodes, and for
-            an episode that cannot be kept: naming episode, key and row.
-        ConfigError: if ``fps`` is not positive, and for bounds that are none.
+        DataError: if the folder exists or its name is not a valid Minari id, without episodes, and,
+            naming episode, key and row, for an episode that cannot be stored.
+        ConfigError: if ``fps`` is not positive, and for invalid bounds.
         MissingExtraError: if minari is not installed.
     """
     path = Path(path)
@@ -109,10 +102,7 @@ def write_episodes(
             folder.absolute() / "data", **_spaces(_arrays(path, "episode_0", first), bounds)
         )
         lengths = []
-        # HDF5's default structures have no checksums, these have; "latest" could only be read by
-        # the very version that wrote it.
-        libver = ("v110", "v110")
-        with h5py.File(folder / "data" / "main_data.hdf5", "w", libver=libver) as file:
+        with h5py.File(folder / "data" / "main_data.hdf5", "w", libver=VERSION) as file:
             for i, episode in enumerate(chain([first], remaining)):
                 check_episode(path, f"episode_{i}", episode, layout=layout, bounds=bounds)
                 for key in sorted(set(first.extras) ^ set(episode.extras)):
@@ -137,20 +127,20 @@ def _dataset_id(path: Path) -> str:
         raise DataError(
             path,
             None,
-            "no id of Minari's; valid: <namespace>/<name>-v<number> of letters, digits, '-' and "
+            "not a Minari id; valid: <namespace>/<name>-v<number> of letters, digits, '-' and "
             "'_', at least two of them in the namespace, such as sawyer/lift-v0",
         )
     return f"{whole.parent.name}/{whole.name}"
 
 
 def _arrays(path: Path, name: str, episode: Episode) -> dict[str, np.ndarray]:
-    """What the file keeps of an episode, by its key below the episode."""
+    """The arrays that the file stores of an episode, by their keys below the episode."""
     whole = join_observations(path, name, episode)
     last = np.arange(len(episode)) == len(episode) - 1
     terminated = episode.terminated.astype(bool)
     infos = {key: np.concatenate([array, array[-1:]]) for key, array in episode.extras.items()}
     if "success" in infos:
-        message = "Minari's name for the extra 'successes'; valid: another name"
+        message = "the name that Minari uses for the extra 'successes'; valid: another name"
         raise DataError(path, f"{name}/success", message)
     if "successes" in infos:
         successes = episode.extras["successes"]
@@ -168,7 +158,9 @@ def _arrays(path: Path, name: str, episode: Episode) -> dict[str, np.ndarray]:
         if key.count("/") > 1 or key.endswith(("/", "/.")):
             raise DataError(path, f"{name}/{key}", "valid: names without '/', neither '' nor '.'")
         if array.dtype.itemsize > 8 or array.dtype == np.uint64 or not array.size:
-            message = f"{array.dtype} {array.shape}; valid: bool, float, int64 and smaller, no 0"
+            message = (
+                f"{array.dtype} {array.shape}; valid: bool, float, int64 and smaller, not empty"
+            )
             raise DataError(path, f"{name}/{key}", message)
     return arrays
 
@@ -178,13 +170,13 @@ def _spaces(arrays: Mapping[str, np.ndarray], bounds: Bounds | None) -> dict[str
         from gymnasium.spaces import Dict
 
     prefix = "observations/"
-    # Pairs, because gymnasium sorts a mapping, and the parts are to come back in their order.
+    # Pairs, because gymnasium would sort a mapping, and the parts keep their order.
     parts = [(key[len(prefix) :], _box(x)) for key, x in arrays.items() if key.startswith(prefix)]
     return {"observation_space": Dict(parts), "action_space": _box(arrays["actions"], bounds)}
 
 
 def _box(array: np.ndarray, bounds: Bounds | None = None) -> Any:
-    """Contains whatever the dtype can hold or, of floating-point numbers, what the bounds do."""
+    """A box of all numbers of the dtype or, for floating-point numbers, of those in the bounds."""
     with needs("data"):
         from gymnasium.spaces import Box
 
@@ -203,16 +195,13 @@ def _write_episode(path: Path, group: h5py.Group, number: int, episode: Episode)
         parent, _, leaf = key.rpartition("/")
         # Not by its whole key: a group made on the way carries the time of day.
         where = group.require_group(parent) if parent else group
-        # Resizable, as Minari's own are. The checksum of zeros is zero: a hole in a file would pass
-        # for data, but not for compressed ones.
-        filters = {"compression": "gzip", "compression_opts": 1, "fletcher32": True}
-        shape = (None, *array.shape[1:])
-        where.create_dataset(leaf, data=array, chunks=True, maxshape=shape, **filters)
+        # Resizable, as Minari's own arrays are.
+        write_array(where, leaf, array, chunks=True, maxshape=(None, *array.shape[1:]))
     for key, value in episode.attributes.items():
         message = f"{type(value).__name__}; valid: numbers, strings and lists of strings"
         try:
             if key in OWN_ATTRIBUTES:
-                raise ValueError("a name of Minari's own")
+                raise ValueError("a name that Minari itself uses")
             write_attributes(group, {key: value})
         except DAMAGE as error:
             raise DataError(path, f"{name}, attribute {key!r}", f"{message} ({error})") from error

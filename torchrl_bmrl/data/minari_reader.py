@@ -1,22 +1,20 @@
-"""The reading half of :mod:`torchrl_bmrl.data.minari`, where the layout is described."""
+"""Reads Minari data sets; :mod:`torchrl_bmrl.data.minari` describes the layout and writes it."""
 
 from __future__ import annotations
 
-import json
 import os
 import re
-from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from torchrl_bmrl.data.arrays import as_flags, check_finite
-from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
+from torchrl_bmrl.data.arrays import as_flags, check_finite, check_lengths
+from torchrl_bmrl.data.episodes import LazyEpisodes
 from torchrl_bmrl.data.hdf5 import (
     DAMAGE,
+    has_rows,
     open_file,
     read_array,
     read_attributes,
@@ -27,13 +25,10 @@ from torchrl_bmrl.data.minari_spaces import (
     Space,
     Spaces,
     is_jpeg,
-    main_file,
-    metadata_file,
     read_rows,
     read_spaces,
 )
-from torchrl_bmrl.data.options import ReadOptions
-from torchrl_bmrl.data.raw import RawEpisode, complete
+from torchrl_bmrl.data.raw import Opened, RawEpisode
 from torchrl_bmrl.data.robomimic import STEP_KEYS
 from torchrl_bmrl.data.schema import ACTION_TOLERANCE
 from torchrl_bmrl.errors import DataError
@@ -49,124 +44,74 @@ _EPISODE = re.compile(r"episode_(0|[1-9]\d*)")
 
 
 @contextmanager
-def open_raw(path: str | os.PathLike[str]) -> Iterator[Mapping[str, RawEpisode]]:
-    """Opens a data set, written here or by Minari; an episode is read when it is asked for.
+def open_data(path: str | os.PathLike[str]) -> Iterator[Opened]:
+    """Opens a data set that was written here or by Minari; each episode is read on access.
 
-    Observations without names are read as the part ``observation``. Where neither flag is set at
-    the end, the episode was cut, which is a truncation. The info ``success`` becomes the extra
-    ``successes``; every other array of numbers among the infos keeps its name and, of T + 1 rows,
-    loses the last. Parts that are neither numbers nor named once (texts, tuples, dictionaries in
-    dictionaries), nested infos, and what else lies there are left alone, and named in
-    ``left_alone``.
+    Observations without names are read as the part ``observation``. An episode with neither flag
+    set at its end was cut, which is a truncation. The info ``success`` becomes the extra
+    ``successes``; every other array of numbers among the infos keeps its name and, if it has T + 1
+    rows, loses the last. Texts, tuples, nested dictionaries and nested infos are not read, but
+    listed in ``left_alone``.
 
     Args:
-        path: the data set's folder, which holds ``data/main_data.hdf5`` and ``data/metadata.json``.
+        path: the data set's folder, with ``data/main_data.hdf5`` and ``data/metadata.json``.
 
     Yields:
-        the episodes as ``episode_0``, ``episode_1``, ...; to be read inside the block.
+        the episodes as ``episode_0``, ``episode_1``, ...; the entries of ``metadata.json``, with
+        ``action_bounds`` (``low`` and ``high``, a number each or a list with one for each
+        dimension) if the space of the actions is a finite box of floating-point numbers; and
+        oddities, among them contradictions between the metadata and the arrays, of which the arrays
+        are used.
 
     Raises:
-        DataError: naming file and key, for a file that is missing, damaged or a git-LFS pointer, a
-            missing key, a wrong number of rows, rows that are not of their space, observations
-            without a part of numbers, or an end inside an episode. What concerns one episode is
-            raised when that is read.
-
-    Example:
-        >>> import tempfile
-        >>> from torchrl_bmrl.data.minari import write_episodes
-        >>> x, a, r = {"x": np.zeros((5, 3))}, np.zeros((5, 2)), np.zeros(5)
-        >>> episode = Episode(
-        ...     observations=x, next_observations=x, actions=a, rewards=r, terminated=r > 0
-        ... )
-        >>> path = Path(tempfile.mkdtemp()) / "sawyer" / "lift-v0"
-        >>> write_episodes(path, [episode])
-        >>> with open_raw(path) as episodes:
-        ...     {name: raw.observations["x"].shape for name, raw in episodes.items()}
-        {'episode_0': (6, 3)}
+        DataError: naming file and key, for a missing or damaged file, a git-LFS pointer, a missing
+            key, a wrong number of rows, rows outside their space, observations without a part of
+            numbers, or an end inside an episode. Faults of one episode are raised when it is read.
     """
     spaces = read_spaces(path)
-    hdf5 = main_file(path)
+    metadata = {key: value for key, value in spaces.metadata.items() if key != "action_bounds"}
+    if (bounds := spaces.actions.bounds) is not None:
+        metadata["action_bounds"] = bounds
+    hdf5 = Path(path) / "data" / "main_data.hdf5"
     with open_file(hdf5) as file:
-        names, _ = _episode_names(hdf5, file)
+        names = read_names(hdf5, file, "/")
+        episodes = [name for name in names if _EPISODE.fullmatch(name)]
+        if not episodes:
+            raise DataError(hdf5, None, "no episodes; valid: at least episode_0")
+        beside = [name for name in names if not _EPISODE.fullmatch(name)]
 
         def read(name: str) -> RawEpisode:
             return _read_episode(hdf5, file, name, spaces)
 
-        yield LazyEpisodes(names, read)
+        yield Opened(
+            episodes=LazyEpisodes(episodes, read),
+            metadata=metadata,
+            oddities=_oddities(hdf5, file, episodes, beside, spaces),
+        )
 
 
-@contextmanager
-def open_episodes(path: str | os.PathLike[str]) -> Iterator[Mapping[str, Episode]]:
-    """Opens a data set like :func:`open_raw`, whose episodes lack nothing.
-
-    Args:
-        path: the data set's folder.
-
-    Yields:
-        the episodes as ``episode_0``, ``episode_1``, ...; to be read inside the block.
-
-    Raises:
-        DataError: as :func:`open_raw`, and for an episode without rewards.
-    """
-    hdf5 = main_file(path)
-    with open_raw(path) as episodes:
-
-        def read(name: str) -> Episode:
-            return complete(hdf5, name, episodes[name], ReadOptions())
-
-        yield LazyEpisodes(episodes, read)
-
-
-def read_metadata(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What ``metadata.json`` says of a data set.
-
-    Returns:
-        its entries and, where the actions' space is a finite box of floating-point numbers,
-        ``action_bounds``: ``low`` and ``high``, a number each or, where the dimensions differ, one
-        for each of them.
-
-    Raises:
-        DataError: naming file and key, if it is missing, damaged, or has no spaces.
-    """
-    spaces = read_spaces(path)
-    metadata: dict[str, Any] = json.loads(metadata_file(path).read_bytes())
-    metadata.pop("action_bounds", None)
-    bounds = spaces.actions.bounds
-    return metadata if bounds is None else {**metadata, "action_bounds": bounds}
-
-
-def find_oddities(path: str | os.PathLike[str]) -> list[str]:
-    """What deserves a look in a data set beside its episodes: warnings.
-
-    Among them is whatever an attribute or ``metadata.json`` says and the arrays contradict; the
-    arrays are believed.
-
-    Raises:
-        DataError: if the data set cannot be opened.
-    """
-    spaces = read_spaces(path)
-    hdf5 = main_file(path)
-    with open_file(hdf5) as file:
-        names, beside = _episode_names(hdf5, file)
-        found: dict[str, list[str]] = {}
-        steps = 0
-        for name in names:
-            try:
-                count = len(file[f"{name}/actions"])
-                attributes = read_attributes(hdf5, file, name)
-                for key, value in (("id", _number(name)), ("total_steps", count)):
-                    if (told := attributes.get(key, value)) != value:
-                        message = f"the attribute {key} contradicts name and arrays"
-                        where = f"{name} ({told!r}, not {value})"
-                        found.setdefault(message, []).append(where)
-                for key, message in _storage_oddities(hdf5, file, name, spaces):
-                    found.setdefault(f"{key}: {message}", []).append(name)
-                steps += count
-            except (DataError, *DAMAGE):
-                continue  # whoever reads the episode says what is wrong with it
+def _oddities(
+    path: Path, file: h5py.File, names: list[str], beside: list[str], spaces: Spaces
+) -> list[str]:
+    found: dict[str, list[str]] = {}
+    steps = 0
+    for name in names:
+        try:
+            count = len(file[f"{name}/actions"])
+            attributes = read_attributes(path, file, name)
+            for key, value in (("id", _number(name)), ("total_steps", count)):
+                if (told := attributes.get(key, value)) != value:
+                    message = f"the attribute {key} contradicts name and arrays"
+                    where = f"{name} ({told!r}, not {value})"
+                    found.setdefault(message, []).append(where)
+            for key, message in _storage_oddities(path, file, name, spaces):
+                found.setdefault(f"{key}: {message}", []).append(name)
+            steps += count
+        except (DataError, *DAMAGE):
+            continue  # reported when the episode is read
     oddities = []
     if beside:
-        oddities.append(f"beside the episodes, left alone: {', '.join(map(repr, beside))}")
+        oddities.append(f"beside the episodes, not read: {', '.join(map(repr, beside))}")
     numbers = set(map(_number, names))
     if gaps := sorted(set(range(max(numbers))) - numbers):
         oddities.append(f"{len(gaps)} episodes are missing, such as episode_{gaps[0]}")
@@ -182,7 +127,7 @@ def find_oddities(path: str | os.PathLike[str]) -> list[str]:
 def _storage_oddities(
     path: Path, file: h5py.File, name: str, spaces: Spaces
 ) -> Iterator[tuple[str, str]]:
-    """How arrays are kept in an episode that may change their numbers: key and message."""
+    """Ways of storing an episode's arrays that may have changed their numbers: key and message."""
     for key, space in {**spaces.parts, "actions": spaces.actions}.items():
         node = read_node(path, file, f"{name}/{key}")
         if not isinstance(node, h5py.Dataset):
@@ -195,16 +140,7 @@ def _storage_oddities(
         for info in read_names(path, file, f"{name}/infos"):
             node = read_node(path, file, f"{name}/infos/{info}")
             if isinstance(node, h5py.Dataset) and is_jpeg(node):
-                yield f"infos/{info}", "stored as JPEG, and left alone"
-
-
-def _episode_names(path: Path, file: h5py.File) -> tuple[list[str], list[str]]:
-    """Names of the episodes, and of what lies beside them."""
-    names = read_names(path, file, "/")
-    episodes = [name for name in names if _EPISODE.fullmatch(name)]
-    if not episodes:
-        raise DataError(path, None, "no episodes; valid: at least episode_0")
-    return episodes, [name for name in names if not _EPISODE.fullmatch(name)]
+                yield f"infos/{info}", "stored as JPEG, and not read"
 
 
 def _number(name: str) -> int:
@@ -220,7 +156,12 @@ def _read_episode(path: Path, file: h5py.File, name: str, spaces: Spaces) -> Raw
     for key, space in spaces.parts.items():
         arrays[key] = read_rows(path, file, f"{name}/{key}", space)
         check_finite(path, f"{name}/{key}", arrays[key])
-    steps = _check_lengths(path, name, arrays)
+    more = tuple(key for key in arrays if key.startswith("observations"))
+    shapes = {key: array.shape for key, array in arrays.items()}
+    steps = check_lengths(path, f"{name}/", shapes, one_more=more)
+    if len(shapes.get("rewards", ())) > 1:
+        message = f"shape {shapes['rewards']}; valid: ({steps},)"
+        raise DataError(path, f"{name}/rewards", message)
     if spaces.actions.bounds is None:
         _check_range(path, f"{name}/actions", arrays["actions"], spaces.actions)
     ends = {flag: _flags(path, f"{name}/{flag}", arrays[flag]) for flag in _FLAGS}
@@ -246,26 +187,6 @@ def _read_episode(path: Path, file: h5py.File, name: str, spaces: Spaces) -> Raw
     )
 
 
-def _check_lengths(path: Path, name: str, arrays: Mapping[str, np.ndarray]) -> int:
-    """Steps of an episode, in which its arrays agree before anything is cut."""
-    more = {key: int(key.startswith("observations")) for key in arrays}
-    for key, array in arrays.items():
-        if not array.ndim:
-            raise DataError(path, f"{name}/{key}", "one number; valid: a row for each step")
-    # Where one array differs from all others, it is the one at fault, even if it is the actions.
-    steps = Counter(len(array) - more[key] for key, array in arrays.items()).most_common(1)[0][0]
-    for key, array in arrays.items():
-        if key == "rewards" and array.ndim > 1:
-            raise DataError(path, f"{name}/{key}", f"shape {array.shape}; valid: ({steps},)")
-        if len(array) != steps + more[key]:
-            message = f"shape {array.shape}; valid: {steps + more[key]} rows"
-            raise DataError(path, f"{name}/{key}", f"{message}, since most arrays are of {steps}")
-    if steps < 1:
-        message = f"shape {arrays['actions'].shape}; valid: at least one row"
-        raise DataError(path, f"{name}/actions", message)
-    return steps
-
-
 def _flags(path: Path, key: str, array: np.ndarray) -> np.ndarray:
     if array.ndim != 1:
         raise DataError(path, key, f"shape {array.shape}; valid: ({len(array)},)")
@@ -284,7 +205,7 @@ def _check_range(path: Path, key: str, actions: np.ndarray, space: Space) -> Non
 def _read_infos(
     path: Path, file: h5py.File, name: str, steps: int
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Arrays with a row for each step, and keys of what is left alone."""
+    """Arrays with a row for each step, and keys of infos that are not read."""
     extras: dict[str, np.ndarray] = {}
     beside = []
     infos = read_names(path, file, f"{name}/infos")
@@ -300,15 +221,12 @@ def _read_infos(
             _flags(path, key, array)
             # Row t + 1 comes after step t.
             extras["successes"] = array[-steps:]
-        elif info not in (*STEP_KEYS, "successes") and _has_rows(node, steps):
+        elif (
+            info not in (*STEP_KEYS, "successes")
+            and has_rows(node, steps, steps + 1)
+            and not is_jpeg(node)
+        ):
             extras[info] = read_array(path, file, key)[:steps]
         else:
             beside.append(f"infos/{info}")
     return extras, beside
-
-
-def _has_rows(node: Any, steps: int) -> bool:
-    """Whether it has a row of numbers for each step, or for each observation."""
-    if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "biuf" or is_jpeg(node):
-        return False
-    return bool(node.size) and len(node.shape) > 0 and node.shape[0] in (steps, steps + 1)

@@ -1,4 +1,4 @@
-"""Spaces of the arrays of a Minari data set, and rows that are of them or refused."""
+"""The spaces of a Minari data set's arrays, and rows that are checked against them."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_bmrl.data.arrays import refuse_pointer
 from torchrl_bmrl.data.hdf5 import DAMAGE, read_array, read_node
 from torchrl_bmrl.data.schema import FLOAT32
 from torchrl_bmrl.errors import DataError
@@ -27,7 +28,7 @@ _JPEG = b"\xff\xd8\xff"
 
 @dataclass(frozen=True)
 class Space:
-    """Rows of one array: shape, dtype, and lowest and highest number."""
+    """Shape, dtype, and lowest and highest number of each row of an array."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
@@ -36,7 +37,7 @@ class Space:
 
     @classmethod
     def of(cls, told: Mapping[str, Any]) -> Space:
-        """A space as Minari writes it into ``metadata.json``."""
+        """Reads a space as Minari writes it into ``metadata.json``."""
         kind = told["type"]
         dtype = np.dtype(told.get("dtype", "int8" if kind == "MultiBinary" else "int64"))
         start = np.asarray(told.get("start", 0))
@@ -55,13 +56,13 @@ class Space:
 
     @property
     def bounds(self) -> dict[str, Any] | None:
-        """Of a finite box of floating-point numbers, for actions; ``None`` of any other space."""
+        """Bounds of a finite box of floating-point numbers; ``None`` for any other space."""
         whole = self.dtype.kind == "f" and bool(np.all(self.low < self.high))
-        # What is as large as float32 goes has no bound in fact.
+        # Bounds as large as float32 allows are no bounds.
         if not whole or np.any(np.abs([self.low, self.high]) >= FLOAT32):
             return None
         low, high = _shortest(self.low), _shortest(self.high)
-        # Lists are for vectors.
+        # Only vectors have lists.
         lists = isinstance(low, list) or isinstance(high, list)
         return None if lists and len(self.shape) > 1 else {"low": low, "high": high}
 
@@ -72,7 +73,7 @@ def _shortest(bound: np.ndarray) -> float | list[float]:
 
 @dataclass(frozen=True)
 class Spaces:
-    """What ``metadata.json`` says of the arrays, by their keys below an episode."""
+    """Spaces of the arrays by their keys below an episode, and the content of ``metadata.json``."""
 
     parts: dict[str, Space]
     actions: Space
@@ -83,24 +84,20 @@ def read_spaces(path: str | os.PathLike[str]) -> Spaces:
     """Reads ``metadata.json``.
 
     Raises:
-        DataError: naming file and key, if it is missing, damaged, a git-LFS pointer, of another
-            storage than HDF5, or has no space of numbers.
+        DataError: naming file and key, if it is missing, damaged, a git-LFS pointer, belongs to a
+            storage other than HDF5, or has no space of numbers.
     """
-    file = metadata_file(path)
+    file = Path(path) / "data" / "metadata.json"
     try:
-        content = file.read_bytes()
-        if content.startswith(b"version https://git-lfs"):
-            raise DataError(
-                file, None, "a git-LFS pointer, not the data; `git lfs pull` fetches them"
-            )
-        metadata = json.loads(content)
+        refuse_pointer(file)
+        metadata = json.loads(file.read_bytes())
         data_format = metadata.get("data_format", "hdf5")
         told = {"observations": json.loads(metadata["observation_space"])}
         if told["observations"]["type"] == "Dict":
             parts = told.pop("observations")["subspaces"]
             told = {f"observations/{part}": space for part, space in parts.items()}
         actions = json.loads(metadata["action_space"])
-        # What is no array stays where it is, as long as something is left to see.
+        # Other spaces are skipped, as long as one part of the observation remains.
         known = {key: space for key, space in told.items() if space["type"] in _SPACES}
         for key, space in {**(told if not known else {}), "actions": actions}.items():
             if space["type"] not in _SPACES:
@@ -123,34 +120,24 @@ def read_spaces(path: str | os.PathLike[str]) -> Spaces:
     return read
 
 
-def metadata_file(path: str | os.PathLike[str]) -> Path:
-    """Where a data set's folder has its metadata."""
-    return Path(path) / "data" / "metadata.json"
-
-
-def main_file(path: str | os.PathLike[str]) -> Path:
-    """Where a data set's folder has its arrays."""
-    return Path(path) / "data" / "main_data.hdf5"
-
-
 def read_rows(
     path: Path, file: h5py.File, key: str, space: Space, *, exact: bool = False
 ) -> np.ndarray:
-    """The rows of an array of a space.
+    """Reads the rows of an array and checks them against their space.
 
     Args:
         path: of the file, for messages.
         file: open for reading.
         key: of the array.
         space: of each row.
-        exact: whether integers where the space has floating-point numbers are refused, too.
+        exact: whether to refuse integers if the space has floating-point numbers.
 
     Raises:
         DataError: for rows of another shape or kind.
     """
     node = read_node(path, file, key)
     if isinstance(node, h5py.Dataset) and is_jpeg(node):
-        # Bytes that were meant as bytes have their space's shape as they are.
+        # Arrays of bytes that are not JPEG have the shape of their space.
         meant = node.shape[1:] == space.shape
         if not meant or _shape(next(_open_images(path, key, node))) == _drop_ones(space.shape):
             return _decode(path, key, node, space)
@@ -166,7 +153,7 @@ def read_rows(
 
 
 def is_jpeg(node: Any) -> bool:
-    """Whether the rows of a dataset are JPEG: bytes of one length, or of any."""
+    """Whether the rows of a dataset are JPEG files, of equal or different lengths."""
     if not isinstance(node, h5py.Dataset) or not node.size:
         return False
     if node.ndim == 1:
@@ -178,13 +165,13 @@ def is_jpeg(node: Any) -> bool:
     try:
         return np.asarray(node[0]).tobytes().startswith(_JPEG)
     except DAMAGE:
-        return False  # whoever reads it says what is wrong
+        return False  # reported when it is read
 
 
 def _decode(path: Path, key: str, node: h5py.Dataset, space: Space) -> np.ndarray:
     images = []
     for i, image in enumerate(_open_images(path, key, node)):
-        # Before anything is decoded, which may take much memory.
+        # Before decoding, which may take much memory.
         if _shape(image) != _drop_ones(space.shape):
             message = f"JPEG of shape {_shape(image)} in row {i}; valid: {space.shape}"
             raise DataError(path, key, f"{message}, as metadata.json says")
@@ -215,7 +202,7 @@ def _shape(image: Any) -> tuple[int, ...]:
 
 
 def _drop_ones(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """A shape without last dimensions of 1, which an image does not tell from none."""
+    """A shape without trailing dimensions of 1, which images do not store."""
     while shape[-1:] == (1,):
         shape = shape[:-1]
     return shape

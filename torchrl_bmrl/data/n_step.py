@@ -1,4 +1,4 @@
-"""n-step transitions: rewards summed over n steps, everything after them from the last of these."""
+"""n-step transitions: rewards summed over n steps, followed by the state after the last of them."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ MASK_KEYS: tuple[NestedKey, ...] = (("collector", "mask"), "mask")
 
 
 class NStep(nn.Module):
-    r"""Turns transitions into n-step transitions that are right where an episode ends.
+    r"""Turns transitions into n-step transitions that stop at the end of an episode.
 
-    Row t gets the rewards of the k steps from t on and, under ``"next"``, what follows the last of
-    them:
+    Row t gets the summed rewards of the k steps from t on and, under ``"next"``, the outcome of the
+    last of them:
 
     .. math::
         R_t = \sum_{i=0}^{k-1} \gamma^i r_{t+i}, \qquad
         y_t = R_t + \gamma^k (1 - d_{t+k-1}) V(s_{t+k}), \qquad k \le n.
 
-    k is n, or fewer where less is left of the episode, of the data, or before padding. The target
-    y is the loss's: TorchRL's TD(0) estimator reads k and the flag d, ``("next", "terminated")``,
-    of step t + k - 1. It bootstraps after a truncation and where the data are cut off, with
-    :math:`\gamma^k`, and not after a termination.
+    k is n, or the number of steps left in the episode, in the data, or before padding. The loss
+    computes the target y: TorchRL's TD(0) estimator reads k and the flag d of step t + k - 1,
+    ``("next", "terminated")``. It bootstraps with :math:`\gamma^k` after a truncation and at the
+    end of the data, but not after a termination.
 
-    An episode ends at its first ``done`` or ``terminated``, that step included. Where
-    ``("collector", "traj_ids")`` or ``episode`` is in the data, it ends before this number changes,
-    too. Without either, nothing tells that an episode was cut off without ``done`` and another one
-    follows: mark its last step as done and truncated, or its rows contain steps of the next one.
-    Rows whose ``("collector", "mask")`` or ``mask`` is ``False`` are padding and stay as they are.
+    An episode ends at its first ``done`` or ``terminated``, that step included. If the data have
+    ``("collector", "traj_ids")`` or ``episode``, it also ends before this number changes. Without
+    either, an episode that was cut off without ``done`` cannot be told from the next one: mark its
+    last step as done and truncated, or its rows will contain steps of the next one. Rows whose
+    ``("collector", "mask")`` or ``mask`` is ``False`` are padding and do not change.
 
-    The rewards of steps after the first are those of the actions in the data: the target is of the
-    policy that collected them for k - 1 steps. Nothing corrects that.
+    The rewards after the first step follow the actions in the data, so that the target belongs to
+    the policy that collected them for k - 1 steps. This is not corrected.
 
     Reference: Sutton and Barto, Reinforcement Learning: An Introduction (2nd edition, 2018),
     equation 7.1, http://incompleteideas.net/book/the-book-2nd.html
 
     Args:
-        n_steps: n, at least 1; 1 leaves rewards and ``"next"`` as they are.
+        n_steps: n, at least 1; 1 does not change rewards and ``"next"``.
         gamma: discount, between 0 and 1; the same as the loss's.
         reward_key: reward under ``"next"``.
         done_key: flag of an episode's end under ``"next"``.
-        terminated_key: flag of a termination under ``"next"``; the data may do without it.
+        terminated_key: flag of a termination under ``"next"``, which the data may lack.
 
     Raises:
         BMRLError: for invalid options.
@@ -86,17 +86,17 @@ class NStep(nn.Module):
         return f"n_steps={self.n_steps}, gamma={self.gamma}"
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Makes n-step transitions; the data given stay as they are.
+        """Makes n-step transitions; the given data do not change.
 
         Args:
             tensordict: transitions in order of time along the last batch dimension: ``[T]``, with
-                several episodes one after the other, or ``[*B, T]``. Transitions drawn at random
-                have no such order: apply this to whole episodes, before a replay buffer takes them,
+                several episodes one after the other, or ``[*B, T]``. Randomly sampled transitions
+                have no such order: apply this to whole episodes, before a replay buffer gets them,
                 or as a collector's ``postproc``. Under ``"next"`` it reads the reward
                 ``(*B, T, 1)`` and the flags ``(*B, T, 1)`` bool.
 
         Returns:
-            a copy with all of ``"next"`` replaced and k in ``steps_to_next_obs (*B, T, 1)`` int64.
+            a copy with ``"next"`` replaced, and k in ``steps_to_next_obs (*B, T, 1)`` int64.
 
         Raises:
             BMRLError: for data without transitions, without reward or done, with an entry of
@@ -114,7 +114,7 @@ class NStep(nn.Module):
         reward, steps = single.clone(), torch.ones_like(ends, dtype=torch.int64)
         alive = torch.ones_like(ends)
         for i in range(1, self.n_steps):
-            # Row t goes on to step t + i if that is in the data and none before it is an end.
+            # Row t includes step t + i if it is in the data and no step before it is an end.
             alive = alive[..., :-1] & ~ends[..., i - 1 : -1]
             if not alive.any():
                 break
@@ -122,14 +122,14 @@ class NStep(nn.Module):
             reward[..., :-i] += later.where(alive, torch.zeros_like(later))
             steps[..., :-i] += alive
         after = data.get("next")
-        if isinstance(after, LazyStackedTensorDict):  # along time it could not be indexed
+        if isinstance(after, LazyStackedTensorDict):  # it cannot be indexed along time
             after = after.contiguous()
         data.set("next", after[_last_steps(steps)])
         data.set(self.reward_key, reward.unsqueeze(-1))
         return data.set(STEPS_KEY, steps.unsqueeze(-1))
 
     def _ends(self, data: TensorDictBase) -> Tensor:
-        """Steps that no row goes beyond, ``(*B, T)``."""
+        """Steps that are the last of every row that contains them, ``(*B, T)``."""
         ends = self._outcome(data, self.done_key)[..., 0].clone()
         if data.get(self.terminated_key, None) is not None:
             ends |= self._outcome(data, self.terminated_key)[..., 0]
@@ -167,7 +167,7 @@ class NStep(nn.Module):
 
 def _last_steps(steps: Tensor) -> tuple[Tensor, ...]:
     """Index of the last step of each row, one tensor for each batch dimension."""
-    # gather() would drop what is no tensor, such as strings.
+    # gather() would drop entries that are not tensors, such as strings.
     rows = [torch.arange(size, device=steps.device) for size in steps.shape]
     *batch, time = torch.meshgrid(*rows, indexing="ij")
     return (*batch, time + steps - 1)

@@ -1,4 +1,4 @@
-"""What is odd about recordings that could be trained on: nobody may have meant it."""
+"""Finds oddities in recordings that can be trained on, but may not be as intended."""
 
 from __future__ import annotations
 
@@ -11,56 +11,39 @@ import numpy as np
 from torchrl_bmrl.data.episodes import Episode, as_success
 
 FROZEN_STEPS = 10
-"""So many observations in a row are equal to the bit by no accident.
+"""This many identical observations in a row are unlikely to be a coincidence.
 
-Half a second at 20 Hz: an arm that is commanded moves within two or three steps, and what is
-simulated or measured at rest still differs in its last digits. Up to three or four equal ones occur
-where a camera or a gripper is read less often than actions are sent.
+It is half a second at 20 Hz. A commanded arm moves within two or three steps, and simulated or
+measured values at rest still differ in their last digits. Up to four identical ones occur if a
+camera or a gripper is read less often than actions are sent.
 """
 AT_REST = 1e-6
-"""Share of its range in an episode that a number at rest may move by in a step."""
+"""Largest change per step of a number at rest, as a share of its range in the episode."""
 NAMED = 8
-"""Names in a message."""
+"""Largest number of names in a message."""
 
 
 @dataclass
 class _Found:
-    """Episodes with one oddity, in their order: what to say of each by its name."""
+    """Episodes with one oddity, in order: a detail of each, by its name."""
 
     episodes: dict[str, str] = field(default_factory=dict)
 
     def example(self) -> str:
-        """The first of them."""
+        """Name and detail of the first one."""
         name, text = next(iter(self.episodes.items()))
         return f"{name} ({text})" if text else name
 
     def names(self) -> str:
-        """All of them, or the first few."""
+        """All names, or the first few."""
         names = list(self.episodes)
         return ", ".join(names[:NAMED]) + (", ..." if len(names) > NAMED else "")
 
 
 class Oddities:
-    """Looks at one episode of a data set after another, and says what deserves a look.
+    """Collects the oddities of a data set, one episode after the other.
 
-    It keeps a few numbers of each episode, and the last observation of the one before.
-
-    Example:
-        >>> x = np.arange(21.0).reshape(-1, 1)
-        >>> x[5:] = 5.0  # the recording stops, the commands go on
-        >>> odd = Oddities()
-        >>> odd.add(
-        ...     "demo_0",
-        ...     Episode(
-        ...         observations={"x": x[:-1]},
-        ...         next_observations={"x": x[1:]},
-        ...         actions=np.linspace(-1, 1, 20).reshape(-1, 1),
-        ...         rewards=np.zeros(20),
-        ...         terminated=np.zeros(20, bool),
-        ...     ),
-        ... )
-        >>> odd.warnings()[0][:61]
-        '1 of 1 episodes have one observation for 10 steps or more whi'
+    It stores a few numbers for each episode, and the previous episode.
     """
 
     def __init__(self) -> None:
@@ -74,11 +57,11 @@ class Oddities:
         self._last: tuple[str, Episode] | None = None
 
     def add(self, name: str, episode: Episode) -> None:
-        """Looks at an episode.
+        """Examines an episode.
 
         Args:
             name: of the episode, for messages.
-            episode: checked; the next one of the file, in the order of the file.
+            episode: a sound one, in the order of the file.
         """
         self._count += 1
         same = {key: _equal_to_next(part) for key, part in episode.observations.items()}
@@ -86,7 +69,7 @@ class Oddities:
             self._frozen.episodes[name] = f"steps {run[0]} to {run[1]}"
         if len(episode) >= FROZEN_STEPS:
             for key, equal in same.items():
-                # What changes at a few steps of an episode may change at none of another.
+                # Parts that change at few steps of one episode may change at none of another.
                 self._varied[key] = self._varied.get(key, 0) + (equal.mean() < 0.5)
                 others = (not other.all() for part, other in same.items() if part != key)
                 if equal.all() and any(others):
@@ -109,7 +92,7 @@ class Oddities:
             self._rewards.episodes[name] = said
 
     def warnings(self) -> list[str]:
-        """What was found: how often, an example, and what it may mean."""
+        """Describes each oddity: its count, an example, and a possible cause."""
         return list(self._warnings())
 
     def _warnings(self) -> Iterator[str]:
@@ -120,7 +103,7 @@ class Oddities:
                 f"actions change, such as {self._frozen.example()}: was the recording stuck?"
             )
         for key, still in self._still.items():
-            # What stands still in most episodes may be left alone in some.
+            # Parts that are constant in most episodes are not reported.
             if len(still.episodes) <= self._varied[key]:
                 yield (
                     f"obs/{key}: never changes in {len(still.episodes)} {of}, such as "
@@ -137,7 +120,7 @@ class Oddities:
                 f"next episode in the file: {self._foreign.names()}. It was probably not recorded, "
                 "as in D4RL's files: values would be bootstrapped from another episode"
             )
-        # Other rewards than a 1 where the task is solved say nothing of success.
+        # Only rewards that are 1 for a solved task can contradict success.
         sparse = self._sparse and 0 < self._reward < self._steps / 2
         if sparse and (found := self._rewards.episodes):
             yield (
@@ -147,7 +130,7 @@ class Oddities:
 
 
 def _equal_to_next(rows: np.ndarray) -> np.ndarray:
-    """Which rows equal the next one to the bit, ``(T - 1,)``."""
+    """Whether each row is identical to the next one, ``(T - 1,)``."""
     return (rows[1:] == rows[:-1]).all(axis=tuple(range(1, rows.ndim)))
 
 
@@ -156,9 +139,9 @@ def _changes(rows: np.ndarray) -> bool:
 
 
 def _longest(equal: np.ndarray, episode: Episode) -> tuple[int, int] | None:
-    """First and last step of the longest stretch of one observation under several actions."""
+    """First and last step of the longest run of one observation while actions change."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], equal, [False]]).astype(int)))
-    # Rows first to last are equal; the actions between them had no effect.
+    # Rows first to last are identical: the actions between them had no effect.
     runs = [
         (int(first), int(last))
         for first, last in edges.reshape(-1, 2)
@@ -168,9 +151,9 @@ def _longest(equal: np.ndarray, episode: Episode) -> tuple[int, int] | None:
 
 
 def _idle_steps(episode: Episode) -> int:
-    """Steps at the end of an episode in which neither action nor observation changes, if many."""
+    """Number of last steps in which neither action nor observation changes; 0 if only a few."""
     still = _equal_to_next(episode.actions)
-    # Those after one action at least: a first step cannot tell whether its action is new.
+    # At least one step comes before them: the first step has no action to compare with.
     if not (steps := _trailing(still)):
         return 0
     for key, part in episode.observations.items():
@@ -183,15 +166,14 @@ def _idle_steps(episode: Episode) -> int:
 
 
 def _trailing(flags: np.ndarray) -> int:
-    """How many at the end are all true."""
+    """Number of true flags at the end."""
     return len(flags) if flags.all() else int(np.argmin(flags[::-1]))
 
 
 def _is_foreign(episode: Episode, following: Episode) -> bool:
-    """Whether an episode's last next observation is the following one's first observation.
+    """Whether an episode's last next observation belongs to the following episode.
 
-    Where a long recording was cut into pieces it is that rightly: there the last step is as small
-    as the others.
+    Pieces of one long recording are excluded: there, the last step is as small as the others.
     """
     if set(episode.observations) != set(following.observations):
         return False
@@ -204,7 +186,7 @@ def _is_foreign(episode: Episode, following: Episode) -> bool:
         steps = np.abs(np.diff(rows, axis=0))
         jump = steps[len(part) - 1]
         usual = np.delete(steps, len(part) - 1, axis=0).max(axis=0, initial=0.0)
-        # Numbers that are all over their range at every step tell nothing.
+        # Numbers that jump over their whole range at every step say nothing.
         smooth = 2 * usual <= np.ptp(rows, axis=0)
         if (smooth & (jump > 2 * usual)).any():
             return True
@@ -214,5 +196,5 @@ def _is_foreign(episode: Episode, following: Episode) -> bool:
 
 
 def _numbers(rows: np.ndarray) -> np.ndarray:
-    """Rows as vectors, so that differences neither wrap around nor fail."""
+    """Rows as float vectors, whose differences neither overflow nor fail."""
     return np.asarray(rows, dtype=np.float64).reshape(len(rows), math.prod(rows.shape[1:]))

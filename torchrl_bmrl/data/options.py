@@ -1,9 +1,10 @@
-"""How a file of demonstrations is read: one set of options for loading, checking and converting."""
+"""Options for reading demonstrations, shared by loading, checking and converting."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import reduce
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -18,27 +19,27 @@ Bounds = tuple[float | Sequence[float], float | Sequence[float]]
 
 @dataclass(frozen=True, kw_only=True)
 class ReadOptions:
-    """What a reader does where a file leaves something open.
+    """Choices that a reader makes if a file leaves something open.
 
     Attributes:
         split: name of a mask, such as ``"train"``; ``None`` for all episodes.
         observation_keys: parts of the observation to read; ``None`` for all.
         dones_terminate: whether ``dones`` at an episode's last step is a termination, in files
-            without ``terminated``. By default it is not: the simulators that these files come from
+            without ``terminated``. The default is ``False``, because the simulators of these files
             do not terminate, and the value after a horizon is not 0.
-        last_step: what becomes of an episode's last step where no observation after it was
-            recorded. ``"drop"`` leaves it out, its reward and success with it. ``"truncate"`` and
-            ``"terminate"`` keep it and let its own observation stand for the next one;
-            after ``"truncate"`` the value is bootstrapped from there, after ``"terminate"`` none
-            follows. ``None``: as ``"drop"``, but a data set that loses all of its reward, or all of
-            its successes, is refused. A step that terminates is kept in any case.
-        reward: where rewards come from, if not from the file. ``"success"``: 1 at each step that
-            ``successes`` marks or, in files that have only an attribute ``success``, at the last
-            step of each successful episode, and else 0. ``"last"``: 1 at every episode's last step.
-        successful: leaves out the episodes that did not succeed.
-        bounds: of floating-point actions, where they are not those that the file states or, if it
-            states none, [-1, 1]. ``"data"``: each dimension's smallest and largest.
-        horizon: steps of the longest episode, for D4RL's files without ``timeouts``.
+        last_step: treatment of an episode's last step if no observation after it was recorded.
+            ``"drop"`` leaves it out, with its reward and success. ``"truncate"`` and
+            ``"terminate"`` keep it and use its own observation as the next one; after
+            ``"truncate"`` the value is bootstrapped from there, after ``"terminate"`` it is 0.
+            ``None`` is ``"drop"``, but refuses a data set that would lose all of its reward, or all
+            of its successes. A step that terminates is always kept.
+        reward: source of the rewards; ``None`` for the file. ``"success"``: 1 at each step that
+            ``successes`` marks or, in files with only an attribute ``success``, at the last step of
+            each successful episode, and else 0. ``"last"``: 1 at every episode's last step.
+        successful: whether to leave out the episodes that did not succeed.
+        bounds: lowest and highest floating-point action. ``None`` for those that the file states,
+            or else [-1, 1]; ``"data"`` for each dimension's smallest and largest action.
+        horizon: number of steps of the longest episode, for D4RL's files without ``timeouts``.
 
     Raises:
         ConfigError: for invalid values.
@@ -91,7 +92,7 @@ class ReadOptions:
         if isinstance(keys, str) or not isinstance(keys, Iterable | None):
             raise ConfigError(f"observation_keys is {keys!r}; valid: a list of names")
         if keys is not None:
-            # In their order, each once.
+            # Each name once, in order.
             names = tuple(dict.fromkeys(keys))
             if wrong := [key for key in names if not isinstance(key, str)]:
                 raise ConfigError(f"observation_keys has {wrong[0]!r}; valid: names")
@@ -106,20 +107,16 @@ class ReadOptions:
             if value is not None and not (isinstance(value, str) and value in valid):
                 raise ConfigError(f"{name} is {value!r}; valid: {', '.join(valid)}, None")
         bounds: Any = self.bounds
-        # An array would be compared with "data" element by element.
+        # isinstance first: an array would be compared with "data" element by element.
         if bounds is not None and not (isinstance(bounds, str) and bounds == "data"):
             object.__setattr__(self, "bounds", check_bounds(bounds))
 
 
 def check_bounds(bounds: Bounds, name: str = "bounds") -> Bounds:
-    """Lowest and highest action as floats, or tuples of floats.
+    """Returns the lowest and the highest action as floats or tuples of floats.
 
     Raises:
-        ConfigError: for anything else, and for a lowest that is not below the highest.
-
-    Example:
-        >>> check_bounds(([0, -1], 2))
-        ((0.0, -1.0), 2.0)
+        ConfigError: for other values, and if the lowest is not below the highest.
     """
     try:
         low, high = (np.asarray(bound, dtype=float) for bound in bounds)
@@ -132,6 +129,30 @@ def check_bounds(bounds: Bounds, name: str = "bounds") -> Bounds:
             "for each dimension in place of either"
         )
     return _plain(low), _plain(high)
+
+
+def join_bounds(bounds: Sequence[Bounds]) -> Bounds:
+    """The narrowest bounds that contain all of the given ones.
+
+    Args:
+        bounds: at least one.
+
+    Raises:
+        ConfigError: if they have different numbers of dimensions.
+
+    Example:
+        >>> join_bounds([(-1.0, 1.0), ((-2.0, 0.0), (0.5, 0.5))])
+        ((-2.0, -1.0), (1.0, 1.0))
+    """
+    arrays: list[list[Any]] = [[np.asarray(end, dtype=float) for end in pair] for pair in bounds]
+    try:
+        low = reduce(np.minimum, [low for low, _ in arrays])
+        high = reduce(np.maximum, [high for _, high in arrays])
+    except ValueError as error:
+        sizes = sorted({end.size for pair in arrays for end in pair if end.ndim})
+        message = f"the actions' bounds have {sizes} dimensions; valid: equally many"
+        raise ConfigError(message) from error
+    return check_bounds((low, high))
 
 
 def _plain(bound: np.ndarray) -> float | tuple[float, ...]:

@@ -1,8 +1,8 @@
-"""Episodes as files have them, and what the options make of what they lack."""
+"""Episodes as files store them, and their completion as the options say."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,19 +16,19 @@ from torchrl_bmrl.errors import DataError
 
 @dataclass(frozen=True, kw_only=True)
 class RawEpisode:
-    """One episode of T steps as a file has it; what the file lacks is ``None``.
+    """One episode of T steps as a file stores it; missing arrays are ``None``.
 
     Attributes:
         observations: named parts before each action ``(T, ...)`` or, with the one after the last,
-            ``(T + 1, ...)``; all of one length.
+            ``(T + 1, ...)``; all of the same length.
         next_observations: the same parts after each action, ``(T, ...)``.
         actions: ``(T, action_dim)``.
         rewards: ``(T,)``.
-        terminated: ``(T,)`` bool; where no value follows.
-        dones: ``(T,)`` bool; where an episode ends, whatever the reason.
+        terminated: ``(T,)`` bool; true if no value follows.
+        dones: ``(T,)`` bool; true at the end of an episode, whatever the reason.
         extras: further arrays of T rows, such as ``successes``.
         attributes: numbers, strings and lists of strings.
-        left_alone: names of what is there and not read.
+        left_alone: names of arrays and groups that are not read.
     """
 
     observations: Mapping[str, np.ndarray]
@@ -43,38 +43,47 @@ class RawEpisode:
 
     @property
     def succeeded(self) -> bool | None:
-        """Whether the task was solved at some step; ``None`` where the file does not say."""
+        """Whether the task was solved at some step; ``None`` if the file does not state it."""
         successes = self.extras.get("successes")
         if successes is None:
             return as_success(self.attributes.get("success"))
         return bool(np.any(successes))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Opened:
+    """A data set that the reader of its format has opened.
+
+    Attributes:
+        episodes: by name; each is read on access, while the data set is open.
+        metadata: what the data set states about itself.
+        prefix: of the episodes' names inside the file, for messages.
+        problems: faults outside the episodes: key and message of each.
+        oddities: warnings about the data set as a whole.
+    """
+
+    episodes: Mapping[str, RawEpisode]
+    metadata: dict[str, Any]
+    prefix: str = ""
+    problems: Sequence[tuple[str, str]] = ()
+    oddities: Sequence[str] = ()
+
+
 def complete(path: str | Path, name: str, raw: RawEpisode, options: ReadOptions) -> Episode:
-    """An episode of a file, with what it lacks as the options say.
+    """Completes an episode of a file as the options say.
 
     Args:
         path: file, for messages.
         name: of the episode, for messages.
-        raw: of arrays that agree in their lengths.
+        raw: the episode, whose arrays agree in their lengths.
         options: see :class:`ReadOptions`.
 
     Returns:
-        the episode; its ``left_out`` says what of the file it does not hold.
+        the episode; its ``left_out`` describes the parts of the file that it does not contain.
 
     Raises:
-        DataError: naming file and key, for rewards that neither the file nor the options tell, for
-            a part of the observation that is asked for and missing, and if no step is left.
-
-    Example:
-        >>> raw = RawEpisode(
-        ...     observations={"x": np.zeros((5, 3))}, actions=np.zeros((5, 2)), rewards=np.ones(5)
-        ... )
-        >>> episode = complete("lift.hdf5", "demo_0", raw, ReadOptions())
-        >>> len(episode), episode.left_out.reward
-        (4, 1.0)
-        >>> len(complete("lift.hdf5", "demo_0", raw, ReadOptions(last_step="truncate")))
-        5
+        DataError: naming file and key, if neither the file nor the options define rewards, if a
+            requested part of the observation is missing, and if no step remains.
     """
     if options.observation_keys is not None:
         raw = _choose_parts(path, name, raw, options.observation_keys)
@@ -85,7 +94,7 @@ def complete(path: str | Path, name: str, raw: RawEpisode, options: ReadOptions)
         if raw.dones is None:
             message = "missing; valid: dones (T,), or dones_terminate=False"
             raise DataError(path, f"{name}/dones", message)
-        # Some files mark every step at which the task is solved: the episode goes on there.
+        # Only the last: some files mark every step at which the task is solved.
         terminated[-1:] = raw.dones[-1:]
     before, after, kept = raw.observations, raw.next_observations, steps
     if after is None and before and all(len(part) == steps + 1 for part in before.values()):
@@ -113,12 +122,12 @@ def complete(path: str | Path, name: str, raw: RawEpisode, options: ReadOptions)
         attributes=raw.attributes,
         left_out=LeftOut(arrays=raw.left_alone),
     )
-    # Uncut, the arrays may differ in their lengths: whoever checks the episode is to see it.
+    # Arrays of different lengths stay as they are, so that checking the episode reports them.
     return whole if kept == steps else _cut(path, name, whole, kept)
 
 
 def _cut(path: str | Path, name: str, episode: Episode, kept: int) -> Episode:
-    """All but the last step of an episode whose observations have been cut already."""
+    """Cuts the last step of an episode whose observations have been cut already."""
     lost = np.asarray(episode.rewards[kept:], dtype=np.float64)
     if not np.isfinite(lost).all():
         raise DataError(path, f"{name}/rewards", f"a value that is not finite in row {kept}")
@@ -144,7 +153,7 @@ def _choose_parts(path: str | Path, name: str, raw: RawEpisode, keys: Iterable[s
     for key in keys:
         if key not in raw.observations:
             valid = ", ".join(raw.observations)
-            raise DataError(path, f"{name}/{key}", f"no part of the observation; valid: {valid}")
+            raise DataError(path, f"{name}/{key}", f"not a part of the observation; valid: {valid}")
     after = raw.next_observations
     return replace(
         raw,
@@ -154,24 +163,24 @@ def _choose_parts(path: str | Path, name: str, raw: RawEpisode, keys: Iterable[s
 
 
 def success_fault(raw: RawEpisode) -> str:
-    """Why it is not known whether an episode succeeded."""
+    """Message that explains why the success of an episode is unknown."""
     if (said := raw.attributes.get("success")) is not None:
-        return f"attribute success is {said!r}, neither 0 nor 1, and there are no successes"
-    return "neither an attribute success nor successes"
+        return f"attribute success is {said!r} instead of 0 or 1, and there are no successes"
+    return "no attribute success and no successes"
 
 
 def rewards_of(path: str | Path, name: str, raw: RawEpisode, options: ReadOptions) -> np.ndarray:
-    """Rewards of an episode, from where the options say.
+    """Rewards of an episode, from the source that the options choose.
 
     Raises:
-        DataError: naming file and key, where neither they nor the file tell.
+        DataError: naming file and key, if that source is missing.
     """
     last = np.arange(len(raw.actions)) == len(raw.actions) - 1
     if options.reward == "last":
         return last.astype(np.float32)
     if options.reward == "success":
         if raw.succeeded is None:
-            raise DataError(path, name, f"{success_fault(raw)}; valid: reward 'last', or none")
+            raise DataError(path, name, f"{success_fault(raw)}; valid: reward 'last', or None")
         return np.asarray(raw.extras.get("successes", last & raw.succeeded), dtype=np.float32)
     if raw.rewards is None:
         message = "missing; valid: rewards (T,), or the option reward 'success' or 'last'"

@@ -1,7 +1,7 @@
-"""Recorded simulator states, with the model that says what they mean.
+"""Reads recorded simulator states together with the model that defines them.
 
-The model is the recording's own MJCF without its meshes, which seldom come along: joints, bodies
-and simple shapes are enough for forward kinematics.
+The model is the recording's own MJCF without its meshes, which are seldom distributed: joints,
+bodies and simple shapes suffice for forward kinematics.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     import mujoco
 
 MAX_GAP = 0.1
-"""Longest time between two recorded rows [s]; nothing is interpolated over more."""
+"""Longest time between two recorded rows [s] that is interpolated over."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """A demonstration as it was recorded: states (T, 1 + nq + nv) and the model they belong to."""
+    """A recorded demonstration: states (T, 1 + nq + nv) and their model."""
 
     path: Path
     demo: str
@@ -37,7 +37,7 @@ class Recording:
     model: mujoco.MjModel
 
     def error(self, message: str, key: str = "") -> DataError:
-        """An error that names the file and the demonstration."""
+        """Makes an error that names the file and the demonstration."""
         return DataError(self.path, self.demo + key, message)
 
 
@@ -60,7 +60,7 @@ def read_recording(path: Path, file: h5py.File, name: str) -> Recording:
 
 
 def _compile(path: Path, key: str, model_file: str) -> mujoco.MjModel:
-    """Model of a recording, from XML text or the name of a file in ``models/``."""
+    """Compiles the model of a recording from XML text or the name of a file in ``models/``."""
     with needs("robosuite"):
         import mujoco
 
@@ -82,7 +82,7 @@ def _compile(path: Path, key: str, model_file: str) -> mujoco.MjModel:
 
 
 def _kinematic_xml(text: str | bytes) -> str:
-    """Bodies, joints, sites and simple shapes of an MJCF: its meshes and textures lie elsewhere."""
+    """Reduces an MJCF to bodies, joints, sites and simple shapes, which need no other files."""
     root = ElementTree.fromstring(text)
     for child in list(root):
         if child.tag not in ("compiler", "default", "worldbody"):
@@ -91,7 +91,7 @@ def _kinematic_xml(text: str | bytes) -> str:
     for compiler in compilers:
         units = {key: value for key, value in compiler.items() if key in ("angle", "eulerseq")}
         compiler.attrib.clear()
-        # Bodies whose mass was their mesh's need some; forward kinematics does not look at it.
+        # Bodies need a mass, also without their mesh; forward kinematics does not use it.
         compiler.attrib.update(units, boundmass="1e-6", boundinertia="1e-9", balanceinertia="true")
     for parent in list(root.iter()):
         parent.attrib.pop("material", None)
@@ -114,7 +114,7 @@ def _check_states(recording: Recording) -> None:
         raise recording.error(f"a value that is not finite in row {bad[0][0]}", "/states")
     times = states[:, 0]
     gaps = np.diff(times)
-    # A gap of just that length is not over it for the rounding of its difference.
+    # The tolerance accepts a gap of exactly that length despite rounding.
     if len(bad := np.flatnonzero((gaps < 0) | (gaps > MAX_GAP + 1e-9))):
         message = f"time goes from {times[bad[0]]:.3f} to {times[bad[0] + 1]:.3f} s in row "
         message += f"{bad[0] + 1}; valid: forward, by {MAX_GAP} s at most"
@@ -122,7 +122,7 @@ def _check_states(recording: Recording) -> None:
     for column in _quaternion_columns(model):
         norms = np.linalg.norm(states[:, column : column + 4], axis=1)
         if len(bad := np.flatnonzero(np.abs(norms - 1) > 0.01)):
-            message = f"columns {column} to {column + 3} are no unit quaternion in row {bad[0]}"
+            message = f"columns {column} to {column + 3} are not a unit quaternion in row {bad[0]}"
             raise recording.error(message, "/states")
 
 
@@ -136,17 +136,17 @@ def _quaternion_columns(model: mujoco.MjModel) -> list[int]:
 
 
 def resample(recording: Recording, frequency: float) -> np.ndarray:
-    """States (N, 1 + nq + nv) at the control rate, from the first recorded row on."""
-    # Of rows at the same time the last counts.
+    """Interpolates states (N, 1 + nq + nv) at the control rate, from the first row on."""
+    # Of several rows at the same time, the last is used.
     states = recording.states[np.append(np.diff(recording.states[:, 0]) > 0, True)].copy()
     times = states[:, 0]
-    # The small number keeps the last row where rounding puts it just before its place on the grid.
+    # The small number keeps the last row if rounding puts it just before its grid point.
     count = int((times[-1] - times[0]) * frequency + 1e-6) + 1
     if count < 2:
         raise recording.error(f"rows at {frequency} Hz: {count}; valid: at least 2", "/states")
     quaternions = _quaternion_columns(recording.model)
     for column in quaternions:
-        # q and -q are the same rotation: neighbours get the same sign before they are mixed.
+        # q and -q are the same rotation: neighbours get the same sign before interpolation.
         part = states[:, column : column + 4]
         part[1:] *= np.cumprod(np.where((part[1:] * part[:-1]).sum(1) < 0, -1, 1))[:, None]
     grid = times[0] + np.arange(count) / frequency

@@ -1,7 +1,7 @@
 """Replay buffers over the data of one task, of several, or of a mixture of data sets.
 
-The data lie one after the other in one storage: a memory map, or the training device's memory where
-they fit. A :class:`~torchrl_bmrl.data.sampler.TaskSampler` draws from them.
+The data are concatenated in one storage: a memory map, or the training device's memory if they fit.
+A :class:`~torchrl_bmrl.data.sampler.TaskSampler` samples from them.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from torchrl_bmrl.errors import BMRLError, ConfigError
 EPISODE_NUMBERS = tuple(
     key for own in (("episode",), ("collector", "traj_ids")) for key in (own, ("previous", *own))
 )
-"""Keys of what numbers episodes."""
+"""Keys of the numbers of episodes."""
 PREFETCH = 2
-"""Samples prepared ahead where every sample is transferred to the device."""
+"""Default number of prefetched samples if every sample is transferred to the device."""
 
 
 def with_previous(data: TensorDictBase, keys: Sequence[Any]) -> TensorDictBase:
     """Adds to each transition the one before it in its episode, under ``"previous"``.
 
-    The first transition of an episode is its own predecessor, and so is one whose predecessor is
-    not in the data.
+    The first transition of an episode is its own predecessor, and so is a transition whose
+    predecessor is not in the data.
 
     Args:
-        data: batch ``[N]`` in the order of the episodes, with ``step``; where it has ``episode``,
-            too, transitions of two episodes are never joined.
+        data: batch ``[N]`` in the order of the episodes, with ``step``. If it also has
+            ``episode``, transitions of two episodes are never joined.
         keys: the keys of a transition to copy.
 
     Example:
@@ -68,21 +68,21 @@ def make_replay_buffer(
     prefetch: int | None = None,
     scratch_dir: str | None = None,
 ) -> TensorDictReplayBuffer:
-    """Buffer that samples single transitions with replacement.
+    """Makes a buffer that samples single transitions with replacement.
 
     Args:
         data: batch ``[N]``; copied once.
-        batch_size: transitions a sample.
-        device: where samples come from, as in :func:`make_multi_task_replay_buffer`.
-        prefetch: samples prepared ahead, as there.
-        scratch_dir: where a memory map lies; a temporary folder by default.
+        batch_size: number of transitions in a sample.
+        device: of the samples, see :func:`make_multi_task_replay_buffer`.
+        prefetch: number of prefetched samples, see there.
+        scratch_dir: folder of the memory map; a temporary one by default.
 
     Returns:
         a buffer of samples ``[batch_size]`` with the keys of the data and ``index``.
 
     Raises:
-        BMRLError: without data, or for numbers that are not finite. Losses look for them on CPU
-            only: elsewhere that would wait for the device.
+        BMRLError: without data, or for numbers that are not finite. The losses check this only on
+            the CPU, because elsewhere the check would wait for the device.
         ConfigError: for invalid options.
 
     Example:
@@ -104,37 +104,37 @@ def make_multi_task_replay_buffer(
     prefetch: int | None = None,
     scratch_dir: str | None = None,
 ) -> TensorDictReplayBuffer:
-    """Buffer whose every sample has one row of ``batch_size`` transitions per task.
+    """Makes a buffer whose samples have one row of ``batch_size`` transitions per task.
 
-    On another device than the CPU the data lie there if they take at most half of its free memory
-    (:func:`fits`); else they are a memory map, and threads prepare samples ahead and transfer them
-    from pinned memory.
+    If ``device`` is a GPU, the data lie in its memory if they take at most half of the free memory.
+    Otherwise they are memory-mapped, and threads prefetch samples and transfer them from pinned
+    memory.
 
-    Draws follow ``torch.manual_seed``. With ``prefetch`` they follow a generator of the buffer's
-    own, seeded by torch's when the buffer is made, since threads draw whenever they run. Equal
-    seeds still give equal samples with ``prefetch=1``; more threads may hand them on in another
+    Sampling follows ``torch.manual_seed``. With ``prefetch`` it uses the buffer's own generator,
+    which torch's seeds when the buffer is made, because the threads' timing varies. Equal seeds
+    then still give equal samples with ``prefetch=1``; more threads may return them in another
     order.
 
     Args:
         datasets: one batch ``[N_i]`` per task, in the order of the tasks, with equal keys, shapes
-            and dtypes; copied once, with numbers of their own for the episodes of each
+            and dtypes. They are copied once, and their episodes renumbered
             (:func:`number_episodes`).
-        batch_size: transitions a row.
-        weights: without them, row i is of task i. With them, one positive number per task, each
-            row is of a task drawn in their proportion, with replacement: a sample may have two rows
-            of one task and none of another, and ``task`` in the data says whose a row is.
-        device: where samples come from; the CPU by default.
-        prefetch: samples prepared ahead, by as many threads; by default two where samples are
-            transferred, none elsewhere.
-        scratch_dir: where a memory map lies; a temporary folder by default.
+        batch_size: number of transitions in a row.
+        weights: ``None`` for row i from task i. With one positive number per task, each row comes
+            from a task drawn in proportion to them, with replacement: a sample may have two rows
+            of one task and none of another, and ``task`` in the data tells them apart.
+        device: of the samples; the CPU by default.
+        prefetch: number of prefetched samples and of threads; by default 2 if samples are
+            transferred, else 0.
+        scratch_dir: folder of the memory map; a temporary one by default.
 
     Returns:
         a buffer of samples ``[num_tasks, batch_size]`` with the keys of the data and ``index``. Its
-        ``loads`` takes what its ``dumps`` wrote, for data sets of the same sizes.
+        ``loads`` reads what its ``dumps`` wrote, for data sets of the same sizes.
 
     Raises:
-        BMRLError: without data sets; for one that is empty, differs from the first in a key, shape
-            or dtype, or has a number that is not finite.
+        BMRLError: without data sets, and for a data set that is empty, differs from the first in a
+            key, shape or dtype, or has a number that is not finite.
         ConfigError: for invalid options.
 
     Example:
@@ -158,17 +158,17 @@ def make_mixed_replay_buffer(
     prefetch: int | None = None,
     scratch_dir: str | None = None,
 ) -> TensorDictReplayBuffer:
-    """Buffer over a mixture of data sets, such as scripted and human demonstrations of one task.
+    """Makes a buffer over a mixture, such as scripted and human demonstrations of one task.
 
     Args:
-        datasets: batches ``[N_i]`` with equal keys, shapes and dtypes; copied once, with numbers of
-            their own for the episodes of each (:func:`number_episodes`).
-        weights: one number per data set, none negative: a transition is of data set i with the
-            probability ``weights[i] / sum(weights)``, however large the data set is.
-        batch_size: transitions a sample.
-        device: where samples come from, as in :func:`make_multi_task_replay_buffer`.
-        prefetch: samples prepared ahead, as there.
-        scratch_dir: where a memory map lies; a temporary folder by default.
+        datasets: batches ``[N_i]`` with equal keys, shapes and dtypes. They are copied once, and
+            their episodes renumbered (:func:`number_episodes`).
+        weights: one number per data set, none negative. A transition comes from data set i with
+            probability ``weights[i] / sum(weights)``, whatever the sizes.
+        batch_size: number of transitions in a sample.
+        device: of the samples, see :func:`make_multi_task_replay_buffer`.
+        prefetch: number of prefetched samples, see there.
+        scratch_dir: folder of the memory map; a temporary one by default.
 
     Returns:
         a buffer of samples ``[batch_size]`` with the keys of the data and ``index``.
@@ -190,20 +190,20 @@ def make_mixed_replay_buffer(
 
 
 def number_episodes(datasets: Sequence[TensorDictBase]) -> list[TensorDictBase]:
-    """Data sets in which no two episodes have one number, so that nothing joins steps of both.
+    """Renumbers the episodes of several data sets so that no two have the same number.
 
-    The episodes of every file are numbered from 0. Those of a data set go on after the ones before
-    it; numbers that are larger anyway stay.
+    The episodes of every file are numbered from 0. Here, each data set continues after the one
+    before it, unless its numbers are larger already.
 
     Args:
-        datasets: batches ``[N_i]``; they stay as they are.
+        datasets: batches ``[N_i]``, which are not changed.
 
     Returns:
-        the same data, with other ``episode`` and ``("collector", "traj_ids")``, those under
-        ``"previous"`` included, where they are whole numbers.
+        the same data with other ``episode`` and ``("collector", "traj_ids")``, also under
+        ``"previous"``, if they are integers.
 
     Raises:
-        BMRLError: if the numbers are too many for their type.
+        BMRLError: if a number exceeds its dtype.
 
     Example:
         >>> from tensordict import TensorDict
@@ -223,8 +223,8 @@ def number_episodes(datasets: Sequence[TensorDictBase]) -> list[TensorDictBase]:
                 value = data.get(key)
                 if high + shift > torch.iinfo(value.dtype).max:
                     raise BMRLError(
-                        f"data set {number}: {key!r} is {value.dtype}; valid: a type that holds "
-                        f"{high + shift}, as the episodes of all data sets are numbered together"
+                        f"data set {number}: {key!r} is {value.dtype}; valid: a dtype up to "
+                        f"{high + shift}, because all data sets' episodes are numbered together"
                     )
                 data = data.copy().set(key, value + shift)
         numbered.append(data)
@@ -237,12 +237,7 @@ def _is_whole(value: Any) -> bool:
 
 
 def fits(datasets: Sequence[TensorDictBase], device: torch.device) -> bool:
-    """Whether data take at most half of a CUDA device's free memory; no other device is asked.
-
-    Example:
-        >>> fits([], torch.device("cpu"))
-        False
-    """
+    """Whether data take at most half of a CUDA device's free memory; ``False`` elsewhere."""
     if device.type != "cuda":
         return False
     return sum(data.bytes() for data in datasets) <= torch.cuda.mem_get_info(device)[0] / 2
@@ -274,7 +269,7 @@ def _make_buffer(
             storage.set(slice(start, end), data)
     except (OSError, RuntimeError) as error:
         where = scratch_dir or "the temporary folder"
-        raise BMRLError(f"the data cannot be kept in {where} ({error})") from error
+        raise BMRLError(f"the data cannot be stored in {where} ({error})") from error
     return DatasetBuffer(
         storage=storage,
         sampler=TaskSampler(sizes, weights=weights, flat=flat, device=storage.device),
@@ -303,14 +298,10 @@ def _check_count(name: str, value: Any, least: int) -> None:
 
 
 def check_device(device: Device) -> torch.device:
-    """A device that torch can use here.
+    """Returns a device that torch can use here.
 
     Raises:
         ConfigError: for any other.
-
-    Example:
-        >>> check_device("cpu")
-        device(type='cpu')
     """
     try:
         return torch.empty(0, device="cpu" if device is None else device).device

@@ -7,12 +7,12 @@ Layout of a file::
         obs/<name>, next_obs/<name>    (T, ...)
         actions               (T, action_dim) in [-1, 1]
         rewards, dones        (T,)  dones: 1 at the last step
-        terminated            (T,)  this library's: where no value follows; absent: nowhere
-        successes             (T,)  this library's: the task's own definition
+        terminated            (T,)  of this library: where no value follows; absent: nowhere
+        successes             (T,)  of this library: the task's own definition of success
         states                (T, n) the simulator's state before each action
     mask/train, mask/valid    names of demonstrations, bytes
 
-Whatever else has T rows is kept as it is.
+Other arrays of T rows are read and written unchanged.
 """
 
 from __future__ import annotations
@@ -27,17 +27,10 @@ from typing import Any
 import numpy as np
 
 from torchrl_bmrl.data.episodes import Episode
-from torchrl_bmrl.data.hdf5 import DAMAGE, write_attributes
+from torchrl_bmrl.data.hdf5 import DAMAGE, VERSION, write_array, write_attributes
 from torchrl_bmrl.data.options import Bounds, check_bounds
-from torchrl_bmrl.data.robomimic_file import (
-    MASKS,
-    count_episodes,
-    count_steps,
-    find_mask_problems,
-    find_oddities,
-    read_metadata,
-)
-from torchrl_bmrl.data.robomimic_reader import STEP_KEYS, open_episodes, open_raw
+from torchrl_bmrl.data.robomimic_file import MASKS, count_episodes, count_steps, read_metadata
+from torchrl_bmrl.data.robomimic_reader import STEP_KEYS, open_data, open_episodes
 from torchrl_bmrl.data.schema import check_episode, layout_of
 from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.extras import needs
@@ -50,11 +43,9 @@ __all__ = [
     "MASKS",
     "count_episodes",
     "count_steps",
-    "find_mask_problems",
-    "find_oddities",
     "keep_episode",
+    "open_data",
     "open_episodes",
-    "open_raw",
     "read_kept_episode",
     "read_metadata",
     "write_episodes",
@@ -70,24 +61,24 @@ def write_episodes(
     masks: Mapping[str, Iterable[int]] | None = None,
     bounds: Bounds = (-1.0, 1.0),
 ) -> None:
-    """Writes a whole file, or leaves none.
+    """Writes a whole file, or nothing.
 
-    Every array carries checksums, and so do names and shapes: damage is found when it is read.
+    Arrays, names and shapes have checksums, so that damage is detected when the file is read.
 
     Args:
-        path: the HDF5 file, which replaces one that is there.
+        path: the HDF5 file; an existing one is replaced.
         episodes: in order, named ``demo_0``, ``demo_1``, ...
         env_args: robomimic's environment metadata: ``env_name``, ``type``, ``env_version`` and
             ``env_kwargs``.
         attributes: further attributes of ``data``.
         masks: positions of the episodes of each mask, such as ``{"train": range(60)}``.
-        bounds: of floating-point actions; other ones than [-1, 1] are kept in the attribute
-            ``action_bounds`` of ``data``, and readers of this library take them from there.
+        bounds: of floating-point actions. Bounds other than [-1, 1] are stored in the attribute
+            ``action_bounds`` of ``data``, which this library's readers use.
 
     Raises:
-        DataError: for an episode that could not be trained on, without episodes, and if an extra is
-            named like one of the layout's own arrays.
-        ConfigError: if a mask has a position that no episode has.
+        DataError: for an episode that cannot be trained on, without episodes, and for an extra with
+            the name of one of the layout's own arrays.
+        ConfigError: for a position in a mask that is not an episode's.
 
     Example:
         >>> import tempfile
@@ -102,10 +93,7 @@ def write_episodes(
         {'train': ['demo_0', 'demo_1']}
     """
     bounds = check_bounds(bounds)
-    # HDF5's default structures have no checksums, these have; "latest" could only be read by the
-    # very version that wrote it.
-    version = ("v110", "v110")
-    with atomic_path(path) as temporary, h5py.File(temporary, "w", libver=version) as file:
+    with atomic_path(path) as temporary, h5py.File(temporary, "w", libver=VERSION) as file:
         data = file.create_group("data")
         names: list[str] = []
         total = 0
@@ -124,12 +112,12 @@ def write_episodes(
             texts["action_bounds"] = json.dumps({"low": bounds[0], "high": bounds[1]})
         write_attributes(data, {"total": total, **texts, **(attributes or {})})
         for name, positions in (masks or {}).items():
-            # Not as file["mask/..."]: a group made on the way carries the time of day.
+            # Not as file["mask/..."]: an implicitly created group stores the time of day.
             positions = list(positions)
             if wrong := [i for i in positions if not 0 <= i < len(names)]:
                 raise ConfigError(f"mask {name!r} has {wrong[0]}; valid: 0 to {len(names) - 1}")
             mask = np.array([names[i] for i in positions], dtype="S")
-            _write_array(file.require_group("mask"), name, mask)
+            write_array(file.require_group("mask"), name, mask)
 
 
 def _check_names(path: str | Path, demo: str, episode: Episode) -> None:
@@ -142,12 +130,18 @@ def _check_names(path: str | Path, demo: str, episode: Episode) -> None:
             raise DataError(path, f"{demo}/{key}", "valid: names without '/'")
 
 
+def _observations(episode: Episode) -> dict[str, np.ndarray]:
+    return {
+        **{f"obs/{name}": part for name, part in episode.observations.items()},
+        **{f"next_obs/{name}": part for name, part in episode.next_observations.items()},
+    }
+
+
 def _write_episode(demo: h5py.Group, episode: Episode) -> None:
     dones = np.zeros(len(episode), dtype=np.int64)
     dones[-1:] = 1
     arrays = {
-        **{f"obs/{name}": part for name, part in episode.observations.items()},
-        **{f"next_obs/{name}": part for name, part in episode.next_observations.items()},
+        **_observations(episode),
         "actions": episode.actions,
         "rewards": episode.rewards,
         "dones": dones,
@@ -155,24 +149,16 @@ def _write_episode(demo: h5py.Group, episode: Episode) -> None:
         **episode.extras,
     }
     for key, array in arrays.items():
-        _write_array(demo, key, array)
+        write_array(demo, key, array)
     write_attributes(demo, {"num_samples": len(episode), **episode.attributes})
 
 
-def _write_array(group: h5py.Group, key: str, array: np.ndarray) -> None:
-    # The checksum of zeros is zero: a hole in a file would pass for data, but not for compressed
-    # ones. What has no elements cannot be cut into chunks, which checksums and filters belong to.
-    filters = {"compression": "gzip", "compression_opts": 1, "fletcher32": True}
-    group.create_dataset(key, data=array, **(filters if array.size else {}))
-
-
 def keep_episode(path: Path, episode: Episode) -> None:
-    """Keeps one episode as an npz file, atomically, until its file is complete."""
+    """Writes one episode to a temporary npz file, atomically, until all episodes are collected."""
     buffer = io.BytesIO()
     np.savez(
         buffer,
-        **{f"obs/{name}": part for name, part in episode.observations.items()},
-        **{f"next_obs/{name}": part for name, part in episode.next_observations.items()},
+        **_observations(episode),
         **{f"extras/{name}": array for name, array in episode.extras.items()},
         actions=episode.actions,
         rewards=episode.rewards,
@@ -183,7 +169,7 @@ def keep_episode(path: Path, episode: Episode) -> None:
 
 
 def read_kept_episode(path: Path) -> Episode:
-    """Reads what :func:`keep_episode` wrote.
+    """Reads an episode that :func:`keep_episode` wrote.
 
     Raises:
         DataError: if the file is missing or damaged.
@@ -210,4 +196,4 @@ def read_kept_episode(path: Path) -> Episode:
             attributes=attributes,
         )
     except (*DAMAGE, EOFError, zipfile.BadZipFile) as error:
-        raise DataError(path, None, f"not a whole episode ({error}); remove it") from error
+        raise DataError(path, None, f"not a complete episode ({error}); remove it") from error

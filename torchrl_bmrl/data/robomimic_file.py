@@ -1,4 +1,4 @@
-"""A file in robomimic's layout as a whole: which episodes it has, its masks, its attributes."""
+"""Reads episode names, masks and attributes of a file in robomimic's layout."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ MASKS = ("train", "valid")
 
 
 def episode_names(path: str | Path, file: h5py.File, split: str | None = None) -> list[str]:
-    """Names of all demonstrations, or of a mask's.
+    """Names of all demonstrations, or of those in a mask.
 
     Raises:
-        DataError: if there are none, or the mask is missing or names one that is.
+        DataError: if there are none, if the mask is missing, or if it names a missing one.
     """
     names, _ = _demonstrations(path, file)
     if split is not None:
@@ -47,11 +47,11 @@ def episode_names(path: str | Path, file: h5py.File, split: str | None = None) -
 
 
 def _demonstrations(path: str | Path, file: h5py.File) -> tuple[list[str], list[str]]:
-    """Names of the demonstrations below ``data``, and of what lies beside them."""
+    """Names of the demonstrations below ``data``, and of other entries there."""
     names: list[str] = []
     beside: list[str] = []
     for name in read_names(path, file, "data"):
-        # What is named like one is one, damaged or not.
+        # Such a name means a demonstration, damaged or not.
         found = re.fullmatch(r"demo_?\d+", name) or _is_demonstration(path, file, f"data/{name}")
         (names if found else beside).append(name)
     return names, beside
@@ -60,7 +60,7 @@ def _demonstrations(path: str | Path, file: h5py.File) -> tuple[list[str], list[
 def _is_demonstration(path: str | Path, file: h5py.File, key: str) -> bool:
     node = read_node(path, file, key)
     if not isinstance(node, h5py.Group):
-        return node is None  # damaged: reading it will say so
+        return node is None  # damaged: reported when it is read
     return bool({"actions", "obs", "states"} & set(read_names(path, file, key)))
 
 
@@ -91,11 +91,11 @@ def count_episodes(path: str | Path) -> int:
 
 
 def count_steps(path: str | Path, episodes: Mapping[str, Episode]) -> int:
-    """Steps of the episodes of a file together, without reading what need not be read.
+    """Total number of steps of a file's episodes, read from the shapes of their arrays if possible.
 
     Args:
         path: the file.
-        episodes: of :func:`open_episodes`.
+        episodes: those to count, as :func:`open_episodes` returns them.
 
     Raises:
         DataError: if the file is damaged or lacks the actions of one.
@@ -114,22 +114,27 @@ def count_steps(path: str | Path, episodes: Mapping[str, Episode]) -> int:
 
 
 def read_metadata(path: str | Path) -> dict[str, Any]:
-    """Attributes of a file, ``env_args`` and ``action_bounds`` parsed, and its masks.
+    """Attributes of a file, with ``env_args`` and ``action_bounds`` parsed, and its masks.
 
     Returns:
-        the attributes by name, and ``masks``: names of demonstrations by mask. Where the file
-        states them, ``action_bounds`` has ``low`` and ``high``, a number or a list of one for each
-        dimension.
+        the attributes by name, and ``masks``: names of demonstrations by mask. ``action_bounds``,
+        if the file states them, has ``low`` and ``high``: a number each, or a list with one for
+        each dimension.
 
     Raises:
-        DataError: if the file is missing or damaged, or ``env_args`` or ``action_bounds`` are not
-            what they should be.
+        DataError: if the file is missing or damaged, or ``env_args`` or ``action_bounds`` are
+            invalid.
     """
     with open_file(path) as file:
-        read_names(path, file, "data")
-        attributes = read_attributes(path, file, "data")
-        masks = read_masks(path, file)
-        attributes["masks"] = {name: read_strings(path, file, f"mask/{name}") for name in masks}
+        return metadata_of(path, file)
+
+
+def metadata_of(path: str | Path, file: h5py.File) -> dict[str, Any]:
+    """Metadata of an open file, as :func:`read_metadata` returns them."""
+    read_names(path, file, "data")
+    attributes = read_attributes(path, file, "data")
+    masks = read_masks(path, file)
+    attributes["masks"] = {name: read_strings(path, file, f"mask/{name}") for name in masks}
     attributes["env_args"] = _parse(path, "env_args", attributes.get("env_args", "{}"))
     if "action_bounds" in attributes:
         bounds = _parse(path, "action_bounds", attributes["action_bounds"])
@@ -152,43 +157,34 @@ def _parse(path: str | Path, name: str, text: Any) -> dict[str, Any]:
     return parsed
 
 
-def find_mask_problems(path: str | Path) -> list[tuple[str, str]]:
-    """What is wrong with each mask of a file: key and message."""
-    problems = []
-    with open_file(path) as file:
-        known = set(_demonstrations(path, file)[0])
-        for mask in read_masks(path, file):
-            try:
-                _read_mask(path, file, mask, known)
-            except DataError as error:
-                problems.append((error.key or "mask", error.message))
-    return problems
+def find_mask_problems(path: str | Path, file: h5py.File) -> Iterator[tuple[str, str]]:
+    """Faults of an open file's masks: key and message of each."""
+    known = set(_demonstrations(path, file)[0])
+    for mask in read_masks(path, file):
+        try:
+            _read_mask(path, file, mask, known)
+        except DataError as error:
+            yield error.key or "mask", error.message
 
 
-def find_oddities(path: str | Path) -> list[str]:
-    """What deserves a look in a file beside its episodes: warnings."""
-    oddities = []
-    with open_file(path) as file:
-        names, beside = _demonstrations(path, file)
-        others = [name for name in read_names(path, file, "/") if name not in ("data", "mask")]
-        if beside := [*(f"data/{name}" for name in beside), *others]:
-            oddities.append(f"left alone, beside the demonstrations: {', '.join(beside)}")
-        cut = [name for name in names if "next_obs" not in read_names(path, file, f"data/{name}")]
-        if cut:
-            oddities.append(f"{len(cut)} episodes have no next_obs, such as {cut[0]}")
-        oddities += _find_contradictions(path, file, names)
-        present = read_masks(path, file)
-        if set(MASKS) <= set(present):
-            train, valid = (set(read_strings(path, file, f"mask/{mask}")) for mask in MASKS)
-            if both := sorted(train & valid):
-                oddities.append(
-                    f"{len(both)} episodes are in train and in valid, such as {both[0]}"
-                )
-    return oddities
+def find_oddities(path: str | Path, file: h5py.File) -> Iterator[str]:
+    """Warnings about an open file as a whole."""
+    names, beside = _demonstrations(path, file)
+    others = [name for name in read_names(path, file, "/") if name not in ("data", "mask")]
+    if beside := [*(f"data/{name}" for name in beside), *others]:
+        yield f"beside the demonstrations, not read: {', '.join(beside)}"
+    cut = [name for name in names if "next_obs" not in read_names(path, file, f"data/{name}")]
+    if cut:
+        yield f"{len(cut)} episodes have no next_obs, such as {cut[0]}"
+    yield from _find_contradictions(path, file, names)
+    if set(MASKS) <= set(read_masks(path, file)):
+        train, valid = (set(read_strings(path, file, f"mask/{mask}")) for mask in MASKS)
+        if both := sorted(train & valid):
+            yield f"{len(both)} episodes are in train and in valid, such as {both[0]}"
 
 
 def _find_contradictions(path: str | Path, file: h5py.File, names: list[str]) -> Iterator[str]:
-    """Attributes that say another number of steps than the arrays; the arrays are believed."""
+    """Attributes whose number of steps differs from that of the arrays, which are used."""
     total, wrong = 0, []
     try:
         for name in names:
@@ -200,19 +196,19 @@ def _find_contradictions(path: str | Path, file: h5py.File, names: list[str]) ->
             if not _says(said, len(node)):
                 wrong.append(f"{name} says {said} of {len(node)}")
         said = read_attribute(path, file, "data", "total")
-    except DataError:  # told by whoever reads the episodes
+    except DataError:  # reported when the episodes are read
         return
     if wrong:
         yield (
             f"attribute num_samples contradicts the arrays in {len(wrong)} episodes, such as "
-            f"{wrong[0]} steps; the arrays are believed"
+            f"{wrong[0]} steps; the arrays are used"
         )
     if not _says(said, total):
-        yield f"attribute total says {said} steps, the arrays have {total}, and are believed"
+        yield f"attribute total is {said} steps, but the arrays have {total}; the arrays are used"
 
 
 def _says(said: Any, count: int) -> bool:
-    """Whether an attribute is missing, or that number in any of the ways that tools write it."""
+    """Whether an attribute is missing or is this number, in any of the forms that tools write."""
     if isinstance(said, list) and len(said) == 1:
         said = said[0]
     return said is None or said == count or said == str(count)

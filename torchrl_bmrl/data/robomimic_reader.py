@@ -1,8 +1,8 @@
-"""Demonstrations in robomimic's HDF5 layout, and what other tools make of it, read.
+"""Reads demonstrations in robomimic's HDF5 layout, and in the variants that other tools write.
 
-MimicGen, LIBERO, RoboCasa and Isaac Lab write the same layout with parts of their own, and without
-others: no ``next_obs``, no ``rewards``, an attribute ``success`` in place of an array, groups below
-``obs``. What this library has no use for is left alone, and named.
+MimicGen, LIBERO, RoboCasa and Isaac Lab write the same layout with additions and omissions: no
+``next_obs``, no ``rewards``, an attribute ``success`` instead of an array, groups below ``obs``.
+Parts that this library does not use are not read, but listed.
 """
 
 from __future__ import annotations
@@ -27,8 +27,13 @@ from torchrl_bmrl.data.hdf5 import (
     read_node,
 )
 from torchrl_bmrl.data.options import ReadOptions
-from torchrl_bmrl.data.raw import RawEpisode, complete
-from torchrl_bmrl.data.robomimic_file import episode_names
+from torchrl_bmrl.data.raw import Opened, RawEpisode, complete
+from torchrl_bmrl.data.robomimic_file import (
+    episode_names,
+    find_mask_problems,
+    find_oddities,
+    metadata_of,
+)
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.extras import needs
 
@@ -46,23 +51,23 @@ def open_episodes(
     attributes: bool = True,
     **options: Any,
 ) -> Iterator[Mapping[str, Episode]]:
-    """Episodes of a file by name, each read when it is asked for.
+    """Opens a file's episodes by name; each is read on access.
+
+    Files without ``next_obs`` take the next step's ``obs``, and the last row of ``obs`` if it has
+    one row more than there are actions. Otherwise ``last_step`` decides about the last step.
 
     Args:
         path: the HDF5 file; it is only read.
-        extras: further arrays to read, those of them that are there; ``None`` for all that have a
-            row of numbers for each step.
-        attributes: whether to read those of the demonstrations.
-        options: see :class:`~torchrl_bmrl.data.options.ReadOptions`: ``split``,
-            ``observation_keys``, ``dones_terminate``, ``last_step``, ``reward``. Which episodes
-            succeeded and the bounds of actions are for whoever reads the episodes to look at.
-
-    Files without ``next_obs`` take the next step's ``obs``, and where ``obs`` has one row more than
-    there are actions, its last. Otherwise ``last_step`` says what becomes of the last step.
+        extras: further arrays to read if present; ``None`` for all with a row of numbers for each
+            step.
+        attributes: whether to read the attributes of the demonstrations.
+        options: ``split``, ``observation_keys``, ``dones_terminate``, ``last_step`` and ``reward``
+            of :class:`~torchrl_bmrl.data.options.ReadOptions`. The other options have no effect
+            here.
 
     Raises:
-        DataError: naming file and key, for a missing or damaged file, a mask that is missing or
-            names a demonstration that is, and, when an episode is read, for missing keys.
+        DataError: naming file and key, for a missing or damaged file, for a mask that is missing or
+            names a missing demonstration, and, when an episode is read, for missing keys.
         ConfigError: for invalid options.
 
     Example:
@@ -79,7 +84,8 @@ def open_episodes(
         {'demo_2': 5}
     """
     chosen = ReadOptions(**options)
-    with open_raw(path, chosen, extras=extras, attributes=attributes) as raw:
+    with open_file(path) as file:
+        raw = _episodes(path, file, chosen, extras, attributes)
 
         def read(name: str) -> Episode:
             return complete(path, f"data/{name}", raw[name], chosen)
@@ -88,34 +94,53 @@ def open_episodes(
 
 
 @contextmanager
-def open_raw(
-    path: str | Path,
-    options: ReadOptions,
-    *,
-    extras: Iterable[str] | None = None,
-    attributes: bool = True,
-) -> Iterator[Mapping[str, RawEpisode]]:
-    """Episodes of a file by name, as it has them, each read when it is asked for.
+def open_data(
+    path: str | Path, options: ReadOptions, *, to_train: bool = False
+) -> Iterator[Opened]:
+    """Opens a file; each episode is read on access, as the file stores it.
 
-    Args and errors are those of :func:`open_episodes`.
+    Args:
+        path: the HDF5 file; it is only read.
+        options: see :func:`open_episodes`.
+        to_train: whether to skip the episodes' attributes and all extras except ``successes``.
+
+    Raises:
+        DataError: as :func:`open_episodes`.
     """
-    wanted = None if extras is None else set(extras)
+    extras = ("successes",) if to_train else None
     with open_file(path) as file:
-        names = episode_names(path, file, options.split)
-        # Needs a look at every episode: when the first is read.
-        foreign: list[set[str]] = []
+        yield Opened(
+            episodes=_episodes(path, file, options, extras, not to_train),
+            metadata=metadata_of(path, file),
+            prefix="data/",
+            problems=list(find_mask_problems(path, file)),
+            oddities=list(find_oddities(path, file)),
+        )
 
-        def read(name: str) -> RawEpisode:
-            if options.observation_keys is None and not foreign:
-                foreign.append(_foreign_parts(path, file, names))
-            known = foreign[0] if foreign else set()
-            return _read_raw(path, file, f"data/{name}", options, known, wanted, attributes)
 
-        yield LazyEpisodes(names, read)
+def _episodes(
+    path: str | Path,
+    file: h5py.File,
+    options: ReadOptions,
+    extras: Iterable[str] | None,
+    attributes: bool,
+) -> Mapping[str, RawEpisode]:
+    wanted = None if extras is None else set(extras)
+    names = episode_names(path, file, options.split)
+    # Found when the first episode is read, because it takes a look at all of them.
+    foreign: list[set[str]] = []
+
+    def read(name: str) -> RawEpisode:
+        if options.observation_keys is None and not foreign:
+            foreign.append(_foreign_parts(path, file, names))
+        known = foreign[0] if foreign else set()
+        return _read_raw(path, file, f"data/{name}", options, known, wanted, attributes)
+
+    return LazyEpisodes(names, read)
 
 
 def _foreign_parts(path: str | Path, file: h5py.File, names: list[str]) -> set[str]:
-    """Names below ``obs`` that are numbers in no episode: groups and texts of other tools."""
+    """Names below ``obs`` that are arrays of numbers in no episode, such as groups and texts."""
     found: dict[str, bool] = {}
     for name in names:
         key = f"data/{name}/obs"
@@ -126,9 +151,9 @@ def _foreign_parts(path: str | Path, file: h5py.File, names: list[str]) -> set[s
 
 
 def _is_numbers(path: str | Path, file: h5py.File, key: str) -> bool:
-    """Whether it is anything but a group or text."""
+    """Whether a node is neither a group nor text."""
     node = read_node(path, file, key)
-    if node is None:  # damaged: reading it will say so
+    if node is None:  # damaged: reported when it is read
         return True
     return isinstance(node, h5py.Dataset) and node.dtype.kind not in "OSU"
 
@@ -160,9 +185,9 @@ def _read_raw(
         beside += _not_read(path, file, f"{demo}/next_obs", parts)
     if "successes" in present and (extras is None or "successes" in extras):
         steps["successes"] = _read_column(path, file, f"{demo}/successes")
-        as_flags(path, f"{demo}/successes", steps["successes"])  # kept as they are
+        as_flags(path, f"{demo}/successes", steps["successes"])  # checked only
     if after is None:
-        # What the next observations are made of is to be named as the file has it.
+        # The next observations are made of these rows, so errors name the rows of the file.
         for part, key in parts.items():
             check_finite(path, key, observations[part])
         _check_lengths(path, demo, steps, observations, _rows_of_dones(path, file, demo))
@@ -201,7 +226,7 @@ def _read_raw(
 def _parts(
     path: str | Path, file: h5py.File, key: str, options: ReadOptions, foreign: set[str]
 ) -> tuple[dict[str, str], list[str]]:
-    """Keys of the observation's parts by name, and what lies beside them."""
+    """Keys of the observation's parts by name, and names of parts that are not read."""
     if isinstance(read_node(path, file, key), h5py.Dataset):  # Isaac Lab: all terms in one array
         valid = {"observation": key}
     else:
@@ -212,7 +237,7 @@ def _parts(
     for part in options.observation_keys:
         if part not in valid:
             raise DataError(path, f"{key}/{part}", f"missing; valid: {', '.join(valid)}")
-    # Left out on request: not worth a word.
+    # Parts left out on request are not reported.
     return {part: valid[part] for part in options.observation_keys}, []
 
 
@@ -222,7 +247,7 @@ def _next(key: str) -> str:
 
 
 def _not_read(path: str | Path, file: h5py.File, key: str, parts: Mapping[str, str]) -> list[str]:
-    """What lies below ``next_obs`` and not below ``obs``."""
+    """Names below ``next_obs`` that are not below ``obs``."""
     if not isinstance(read_node(path, file, key), h5py.Group):
         return []
     before = key.replace("/next_obs", "/obs")
@@ -237,17 +262,17 @@ def _check_lengths(
     observations: Mapping[str, np.ndarray],
     others: list[int],
 ) -> None:
-    """Compares the arrays of an episode without ``next_obs``, of which a row may be cut.
+    """Compares the lengths of an episode's arrays if it has no ``next_obs``.
 
     Args:
         path: file, for the message.
-        demo: its key, for the message.
+        demo: key of the episode, for the message.
         steps: arrays of T rows.
-        observations: of T rows, or T + 1.
+        observations: arrays of T or T + 1 rows.
         others: numbers of rows of arrays that are not read, and should be T.
 
     Raises:
-        DataError: naming an array whose rows are not as many as most others'.
+        DataError: naming an array whose number of rows differs from that of most others.
     """
     keys = {**steps, **{f"obs/{part}": array for part, array in observations.items()}}
     for key, array in keys.items():
@@ -256,7 +281,7 @@ def _check_lengths(
         if key in steps and key != "actions" and array.ndim > 1:
             raise DataError(path, f"{demo}/{key}", f"shape {array.shape}; valid: ({len(array)},)")
     rows = [len(array) for array in observations.values()]
-    # Observations come before each action, or also after the last.
+    # Observations come before each action, and in some files also after the last.
     likely = Counter([*(len(array) for array in steps.values()), *others])
     count = max(likely, key=lambda n: (likely[n], rows.count(n), rows.count(n + 1)))
     longer = bool(rows) and rows.count(count + 1) > rows.count(count)
@@ -264,11 +289,8 @@ def _check_lengths(
         valid = count + (longer and key.startswith("obs/"))
         if len(array) != valid:
             hint = f" or {count + 1}" if key.startswith("obs/") and not longer else ""
-            raise DataError(
-                path,
-                f"{demo}/{key}",
-                f"shape {array.shape}; valid: {valid}{hint} rows, as the other arrays have",
-            )
+            message = f"shape {array.shape}; valid: {valid}{hint} rows, as the other arrays have"
+            raise DataError(path, f"{demo}/{key}", message)
 
 
 def _rows_of_dones(path: str | Path, file: h5py.File, demo: str) -> list[int]:
@@ -277,10 +299,10 @@ def _rows_of_dones(path: str | Path, file: h5py.File, demo: str) -> list[int]:
 
 
 def _has_rows(path: str | Path, file: h5py.File, key: str, steps: int) -> bool:
-    """Whether it has a row of numbers for each step; other tools keep all sorts of things."""
+    """Whether a node is an array of numbers with a row for each step."""
     node = read_node(path, file, key)
     if node is None:
-        raise DataError(path, key, "unreadable: its name leads nowhere")
+        raise DataError(path, key, "unreadable: a link to a missing node")
     try:
         if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "biuf":
             return False
@@ -294,7 +316,7 @@ def _read_flags(path: str | Path, file: h5py.File, key: str) -> np.ndarray:
 
 
 def _read_column(path: str | Path, file: h5py.File, key: str) -> np.ndarray:
-    """An array of one number a step, which some tools keep as ``(T, 1)``."""
+    """An array of one number for each step, which some tools store as ``(T, 1)``."""
     array = read_array(path, file, key)
     if not array.ndim:
         raise DataError(path, key, "one number; valid: a row for each step")

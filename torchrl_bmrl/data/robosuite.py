@@ -1,14 +1,14 @@
 """robosuite's ``demo.hdf5`` as transitions of one of the six tasks.
 
-Such a file holds the simulator's states of a person's demonstrations, and neither observations nor
-rewards. Both are computed here from those states, never by replaying the input device::
+Such a file contains simulator states of a person's demonstrations, but neither observations nor
+rewards. Both are computed from these states, without replaying the input device::
 
     data/demo_<i>             attribute model_file: models/<model_file> beside the file, or XML text
         states                (T, 1 + nq + nv)  time [s], joint positions, joint velocities
 
-Two models take part. The recording's own MJCF, without its meshes, says which column is which
-joint, where the table stands and how large the cube is. The task's model then gets the same joints
-by name, the cube relative to its own table, and computes everything else with the task's functions.
+Two models are used. The recording's own MJCF, without its meshes, defines the states' columns, the
+position of the table and the size of the cube. The task's model gets the same joints by name, and
+the cube at the same place on its own table; the task's functions compute everything else.
 """
 
 from __future__ import annotations
@@ -42,19 +42,19 @@ The least-squares slope of what a person's demonstrations, executed as actions i
 moved (0.21 along x, 0.17 along y, 0.25 along z; 0.18 to 0.20 of a rotation), whatever their scale.
 """
 JOINTS = (*(f"right_j{i}" for i in range(7)), "l_finger_joint", "r_finger_joint")
-"""How the joints' names end; prefixes such as ``robot0_`` came with later versions."""
+"""Ends of the joints' names; later versions added prefixes such as ``robot0_``."""
 MAX_MODEL_ERROR = 5e-3
-"""How far the end-effector may be apart in the two models [m]."""
+"""Largest accepted distance between the end-effectors of the two models [m]."""
 CLOSING_MOTION, OPENING_MOTION = 1e-3, 3e-3
-"""Change of the fingers' opening in one step that tells a command [m]. A cube that was squeezed
-pushes them apart again, by 2 mm a step, while they are still told to close."""
+"""Change of the fingers' opening in one step that indicates a command [m]. A squeezed cube pushes
+them apart by 2 mm per step although the command is still to close."""
 FINGER_REST = 2e-3
 """Fingers within this of their opening at rest under the command "open" are open [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Relabelling:
-    """What became of one demonstration.
+    """Result of computing one demonstration.
 
     Attributes:
         name: of the demonstration.
@@ -87,7 +87,7 @@ class Relabelling:
 
     @classmethod
     def of(cls, name: str, episode: Episode) -> Relabelling:
-        """What the attributes of an episode of :func:`open_episodes` tell."""
+        """Reads the attributes of an episode of :func:`open_episodes`."""
         kept = {field.name for field in fields(cls)}
         return cls(
             name=name,
@@ -101,7 +101,7 @@ class Relabelling:
 def open_episodes(
     path: str | Path, *, task: str, tracking: float = 1.0
 ) -> Iterator[Mapping[str, Episode]]:
-    r"""Demonstrations by name as episodes of a task, each computed when it is asked for.
+    r"""Opens demonstrations by name as episodes of a task; each is computed on access.
 
     Observations, rewards and successes are the task's own. Actions are differences of the
     end-effector's recorded poses at the control rate (20 Hz), in the axes of the robot's base:
@@ -165,7 +165,7 @@ def open_episodes(
 
 @dataclass(frozen=True, kw_only=True)
 class _Scene:
-    """Where a model keeps what both models have: the same function finds it in either.
+    """Positions of joints, bodies and shapes that both models have.
 
     ``columns``: of a flattened state, by joint. ``hand``: the body that carries the gripper.
     ``cube``: shapes of the cube. ``table``: centre of the table's surface (3,) [m].
@@ -218,7 +218,7 @@ def _find_scene(recording: Recording, model: mujoco.MjModel, *, cube: bool) -> _
 def _only(
     recording: Recording, kind: str, name: str, names: list[str], *, at_start: bool = False
 ) -> int:
-    """Index of the one name that ends like this or, ``at_start``, begins so."""
+    """Index of the only name that ends with ``name`` or, with ``at_start``, begins with it."""
     found = [i for i, given in enumerate(names) if given.endswith(name)]
     if at_start:  # cube, cube_jnt0 and cube_joint0
         found = [i for i, given in enumerate(names) if given.startswith(name)]
@@ -229,7 +229,7 @@ def _only(
 
 
 def _set_cube_size(scene: _Scene, size: np.ndarray) -> None:
-    """Gives the cube its half sizes (3,) [m], and the bounds that MuJoCo derives from them."""
+    """Sets the cube's half sizes (3,) [m], and the bounds that MuJoCo derives from them."""
     model = scene.model
     model.geom_size[scene.cube] = size
     model.geom_rbound[scene.cube] = np.linalg.norm(size)
@@ -240,7 +240,7 @@ def _set_cube_size(scene: _Scene, size: np.ndarray) -> None:
 
 
 def _transfer(recording: Recording, env: TabletopScene, there: _Scene, rows: np.ndarray) -> Any:
-    """The task's states (N, 1 + nq + nv) and scene for the recording's; sets cube and goal."""
+    """Converts states to the task's (N, 1 + nq + nv), finds its scene, and sets cube and goal."""
     here = _find_scene(recording, env.sim.model._model, cube=env.has_cube)
     # The table and not the robot's base ties the scenes together: the bases differ by 1 mm in
     # height, the fingers' and the cube's places over the table by 0.1 mm.
@@ -262,7 +262,7 @@ def _transfer(recording: Recording, env: TabletopScene, there: _Scene, rows: np.
 
 
 def _observe(env: TabletopScene, states: np.ndarray) -> tuple[dict[str, np.ndarray], Any]:
-    """The task's view of its states: parts of the observation; rotations, rewards, successes."""
+    """Computes parts of the observation, and rotations, rewards and successes, of states."""
     seen: dict[str, list[Any]] = {}
     for state in states:
         env.sim.set_state_from_flattened(state)
@@ -283,8 +283,8 @@ def _recorded_path(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The end-effector's path (N, 3) [m] by the recording's model, and rotations (N, 3, 3).
 
-    It is the task's end-effector, carried by the recording's hand: files differ in where theirs is
-    (11.5 mm further out in 2018) and how it is turned.
+    The task's end-effector is attached to the recording's hand, because position (11.5 mm further
+    out in 2018) and rotation of the recording's own end-effector differ between files.
     """
     with needs("robosuite"):
         import mujoco
@@ -357,9 +357,9 @@ def _motion(path: np.ndarray, rotations: np.ndarray) -> np.ndarray:
 def _gripper_commands(opening: np.ndarray) -> np.ndarray:
     """Commands (N - 1,), +1 closes, -1 opens, from the distance between the fingers (N,) [m].
 
-    Fingers that move tell the command; fingers at rest wide open are told to open; fingers that
-    something stops (the cube, each other) keep the command that brought them there. Before the
-    first motion whatever is not open is closing.
+    The motion of the fingers indicates the command. Fingers at rest wide open have the command to
+    open; fingers stopped by the cube or each other keep their last command. Before the first
+    motion, fingers that are not open are closing.
     """
     from torchrl_bmrl.envs.arms import OPEN_FINGERS
 
@@ -376,7 +376,7 @@ def _gripper_commands(opening: np.ndarray) -> np.ndarray:
 
 
 def _action_errors(motion: np.ndarray, path: np.ndarray, hands: np.ndarray) -> tuple[float, float]:
-    """Largest distance [m] and angle [rad] between what motions (T, 6) add up to and a path."""
+    """Largest distance [m] and angle [rad] between summed motions (T, 6) and a path."""
     with needs("robosuite"):
         from scipy.spatial.transform import Rotation
 

@@ -1,4 +1,4 @@
-"""What demonstrations must look like before anything trains on them."""
+"""Checks episodes before anything trains on them."""
 
 from __future__ import annotations
 
@@ -12,16 +12,6 @@ from torchrl_bmrl.data.episodes import Episode, name_fault
 from torchrl_bmrl.data.options import Bounds
 from torchrl_bmrl.errors import ConfigError, DataError
 
-OBSERVATION_SHAPES: dict[str, int] = {
-    "robot0_joint_pos": 7,
-    "robot0_gripper_qpos": 2,
-    "robot0_joint_vel": 7,
-    "robot0_eef_pos": 3,
-    "robot0_eef_quat": 4,
-    "goal_pos": 3,
-}
-"""Parts of the six tasks' observation and their sizes, in the environment's order."""
-ACTION_DIM = 7
 ACTION_TOLERANCE = 1e-6
 FLOAT32 = float(np.finfo(np.float32).max)
 
@@ -29,7 +19,7 @@ Layout = dict[str, tuple[tuple[int, ...], np.dtype]]
 
 
 def arrays_of(episode: Episode) -> dict[str, np.ndarray]:
-    """All arrays of an episode under their names in robomimic's layout."""
+    """All arrays of an episode by their keys in robomimic's layout."""
     return {
         "actions": episode.actions,
         "rewards": episode.rewards,
@@ -41,9 +31,9 @@ def arrays_of(episode: Episode) -> dict[str, np.ndarray]:
 
 
 def layout_of(episode: Episode) -> Layout:
-    """Shape of a row and dtype of what all episodes of a data set share.
+    """Shape of a row and dtype of each array that must be alike in all episodes of a data set.
 
-    Extras are left out, but for ``successes``: models, and so states, may differ.
+    Extras other than ``successes`` are not included, because models, and so states, may differ.
     """
     return {
         key: (array.shape[1:], array.dtype)
@@ -55,37 +45,25 @@ def layout_of(episode: Episode) -> Layout:
 def find_problems(
     episode: Episode, *, layout: Layout | None = None, bounds: Bounds | None = (-1.0, 1.0)
 ) -> Iterator[tuple[str, str]]:
-    """Everything that keeps an episode from being trained on.
+    """Finds all faults that keep an episode from being trained on.
 
     Args:
-        episode: to look at.
+        episode: to check.
         layout: of the data set's other episodes.
         bounds: of floating-point actions; ``None`` for any.
 
     Yields:
-        the key and what is wrong with it.
-
-    Example:
-        >>> part = np.zeros((4, 3))
-        >>> episode = Episode(
-        ...     observations={"x": part},
-        ...     next_observations={"x": part},
-        ...     actions=np.full((4, 7), 2.0),
-        ...     rewards=np.zeros(4),
-        ...     terminated=np.zeros(4, bool),
-        ... )
-        >>> list(find_problems(episode))
-        [('actions', '2.0 in row 0 is outside [-1.0, 1.0]; the option bounds takes others')]
+        key and description of each fault.
     """
     arrays = arrays_of(episode)
-    # Where one array differs from all others, it is the one at fault, even if it is the actions.
+    # If one array differs from all others, it is at fault, even if it is the actions.
     lengths = Counter(len(array) for array in arrays.values() if array.ndim)
     steps = lengths.most_common(1)[0][0] if lengths else 0
     if steps == 0:
         yield "actions", f"shape {episode.actions.shape}; valid: (T, ...) with at least one step"
         return
     if not episode.observations:
-        yield "obs", "no part of an observation; valid: at least one"
+        yield "obs", "no part of the observation; valid: at least one"
     faulty, shared = set(), layout_of(episode)
     for key, array in arrays.items():
         problem = _array_problem(key, array, steps, trained=key in shared)
@@ -118,20 +96,20 @@ def _bound_problems(actions: np.ndarray, bounds: Bounds) -> Iterator[tuple[str, 
     low, high = (np.asarray(bound, dtype=np.float64) for bound in bounds)
     for bound in (low, high):
         if bound.ndim and bound.shape != actions.shape[1:]:
-            yield "actions", f"shape {actions.shape}, and bounds of {bound.shape[0]} dimensions"
+            yield "actions", f"shape {actions.shape}, but bounds of {bound.shape[0]} dimensions"
             return
     slack = ACTION_TOLERANCE * np.maximum(1, np.maximum(np.abs(low), np.abs(high)))
     outside = np.argwhere((actions < low - slack) | (actions > high + slack))
     if len(outside):
         where = tuple(outside[0])
         value = float(actions[where])
-        # Infinite ones are reported above.
+        # Infinite values are reported above.
         if np.isfinite(value):
             valid = list(bounds)
             if low.ndim or high.ndim:
                 ends = (np.broadcast_to(bound, actions.shape[1:]) for bound in (low, high))
                 valid = [float(end[where[1:]]) for end in ends]
-            hint = "" if bounds != (-1.0, 1.0) else "; the option bounds takes others"
+            hint = "" if bounds != (-1.0, 1.0) else "; the option bounds sets others"
             yield "actions", f"{value} in row {where[0]} is outside {valid}{hint}"
 
 
@@ -147,7 +125,7 @@ def _array_problem(key: str, array: np.ndarray, steps: int, *, trained: bool) ->
     if 0 in array.shape:
         return f"shape {array.shape}; valid: rows of at least one number"
     if array.dtype.kind == "f":
-        # What trains is float32: larger numbers would be infinite there.
+        # Training uses float32, in which larger numbers are infinite.
         finite = np.abs(array) <= FLOAT32 if key in ("actions", "rewards") else np.isfinite(array)
         if not finite.all():
             return f"a value that is not finite in row {int(np.argwhere(~finite)[0][0])}"
@@ -187,17 +165,17 @@ def check_episode(
     layout: Layout | None = None,
     bounds: Bounds | None = (-1.0, 1.0),
 ) -> None:
-    """Refuses an episode that :func:`find_problems` finds fault with.
+    """Refuses an episode with faults that :func:`find_problems` finds.
 
     Args:
         path: file, for the message.
         name: of the episode, for the message.
-        episode: to look at.
+        episode: to check.
         layout: of the data set's other episodes.
         bounds: of floating-point actions; ``None`` for any.
 
     Raises:
-        DataError: with the first problem, and how many more there are.
+        DataError: naming the first fault and the number of others.
     """
     problems = list(find_problems(episode, layout=layout, bounds=bounds))
     if problems:
@@ -210,7 +188,7 @@ def check_episode(
 
 
 def check_fps(fps: float) -> None:
-    """Refuses a number of steps per second that is none.
+    """Refuses an invalid number of steps per second.
 
     Raises:
         ConfigError: naming the value.

@@ -1,4 +1,4 @@
-"""Any of the formats, opened: what is in it, by which rules it is read, what is wrong with it."""
+"""Opens data sets of any format."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,8 @@ from torchrl_bmrl.data import d4rl, lerobot_reader, minari, robomimic, robosuite
 from torchrl_bmrl.data.account import Account
 from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
 from torchrl_bmrl.data.hdf5 import open_file, read_names
-from torchrl_bmrl.data.options import Bounds, ReadOptions, check_bounds
-from torchrl_bmrl.data.raw import RawEpisode, complete, success_fault
+from torchrl_bmrl.data.options import Bounds, ReadOptions, check_bounds, join_bounds
+from torchrl_bmrl.data.raw import Opened, RawEpisode, complete, success_fault
 from torchrl_bmrl.errors import ConfigError, DataError
 
 _STRUCTURE = (
@@ -25,7 +24,7 @@ _STRUCTURE = (
     *("dataset_size", "env_args", "env_spec", "masks", "minari_version", "total"),
     *("total_episodes", "total_steps"),
 )
-"""What formats say of their own files, and names that have a meaning of their own here."""
+"""Metadata that describe the file itself, and names with a meaning of their own here."""
 
 FORMATS = ("robomimic", "robosuite", "minari", "d4rl", "lerobot")
 
@@ -37,17 +36,17 @@ class Source:
     Attributes:
         path: of the file or folder.
         format: one of :data:`FORMATS`.
-        episodes: by name, each read when it is asked for.
-        options: by which they are read.
+        episodes: by name; each is read on access.
+        options: how they are read.
         prefix: of the names inside the file, for messages.
         bounds: of floating-point actions: those of the options, else those that the data set
             states, else [-1, 1].
         bounds_stated: whether the options or the data set state these bounds.
         metadata: attributes of the file, ``env_args`` and ``masks`` among them, and
-            ``action_bounds`` where they are not [-1, 1].
-        account: knows the episodes that are left out; whoever reads the others adds them.
-        problems: what is wrong beside the episodes: key and message.
-        oddities: what deserves a look beside them.
+            ``action_bounds`` if they are not [-1, 1].
+        account: counts the episodes that are left out.
+        problems: faults outside the episodes: key and message of each.
+        oddities: warnings about the data set as a whole.
     """
 
     path: Path
@@ -64,7 +63,7 @@ class Source:
 
     @property
     def fps(self) -> float | None:
-        """Steps per second [Hz], where the data set tells them."""
+        """Steps per second [Hz]; ``None`` if the data set does not state it."""
         kwargs = self.metadata.get("env_args", {}).get("env_kwargs")
         rate = kwargs.get("control_freq") if isinstance(kwargs, dict) else None
         for known in (self.metadata.get("fps"), rate):
@@ -75,24 +74,13 @@ class Source:
         return None
 
     def check(self) -> None:
-        """Refuses a data set in which something is wrong beside the episodes.
+        """Refuses a data set with faults outside the episodes.
 
         Raises:
             DataError: for the first of :attr:`problems`.
         """
         for key, message in self.problems:
             raise DataError(self.path, key, message)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Opened:
-    """What a format's reader knows of a data set."""
-
-    episodes: Mapping[str, RawEpisode]
-    metadata: dict[str, Any]
-    prefix: str = ""
-    problems: Sequence[tuple[str, str]] = ()
-    oddities: Sequence[str] = ()
 
 
 def find_format(path: Path) -> str:
@@ -115,7 +103,7 @@ def find_format(path: Path) -> str:
         for name in read_names(path, file, "data"):
             try:
                 present = read_names(path, file, f"data/{name}")
-            except DataError:  # whoever reads it says what is wrong
+            except DataError:  # reported when it is read
                 continue
             if "obs" in present:
                 return "robomimic"
@@ -137,16 +125,17 @@ def open_source(
 
     Args:
         path: an HDF5 file, or the folder of a Minari or LeRobot data set.
-        task: whose scene a robosuite ``demo.hdf5`` was recorded in: it holds states alone.
+        task: the task in whose scene a robosuite ``demo.hdf5``, which only has simulator states,
+            was recorded.
         tracking: see :func:`torchrl_bmrl.data.robosuite.open_episodes`.
-        to_train: reads only what trains: of a file in robomimic's layout neither the episodes'
-            attributes nor, ``successes`` apart, their extras.
+        to_train: whether to skip what training does not need in a file in robomimic's layout:
+            attributes of the episodes, and extras except ``successes``.
         options: see :class:`~torchrl_bmrl.data.options.ReadOptions`.
 
     Raises:
         DataError: for a missing or damaged data set.
-        ConfigError: for a robosuite file without ``task``, and for options that are invalid or that
-            another format has no use for.
+        ConfigError: for a robosuite file without ``task``, and for options that are invalid or do
+            not apply to the format.
 
     Example:
         >>> import tempfile
@@ -164,14 +153,18 @@ def open_source(
     chosen = ReadOptions(**options)
     form = find_format(path)
     if form != "robosuite" and (task is not None or tracking != 1.0):
-        raise ConfigError(f"task and tracking are for robosuite's demo.hdf5; {path} is {form}'s")
+        raise ConfigError(
+            f"task and tracking are for robosuite's demo.hdf5; {path} has the format {form}"
+        )
     if chosen.split is not None and form != "robomimic":
-        raise ConfigError(f"split is {chosen.split!r}, but {path} is {form}'s, which has no masks")
+        raise ConfigError(
+            f"split is {chosen.split!r}, but {path} has the format {form}, without masks"
+        )
     if chosen.horizon is not None and form != "d4rl":
-        raise ConfigError(f"horizon is for D4RL's files; {path} is {form}'s")
+        raise ConfigError(f"horizon is for D4RL's files; {path} has the format {form}")
     with ExitStack() as stack:
         if form == "robomimic":
-            opened = _open_robomimic(stack, path, chosen, to_train)
+            opened = stack.enter_context(robomimic.open_data(path, chosen, to_train=to_train))
         elif form == "robosuite":
             opened = _open_robosuite(stack, path, task, tracking)
         else:
@@ -183,7 +176,7 @@ def open_source(
 def open_sources(
     source: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], **options: Any
 ) -> Iterator[list[Source]]:
-    """Opens one or several data sets, and refuses those with problems beside their episodes.
+    """Opens one or several data sets, and refuses those with faults outside the episodes.
 
     Args:
         source: a path as for :func:`open_source`, or several.
@@ -203,8 +196,8 @@ def open_sources(
         yield sources
 
 
-def _apply(path: Path, form: str, opened: _Opened, options: ReadOptions) -> Source:
-    """Applies the options to what a format's reader has opened."""
+def _apply(path: Path, form: str, opened: Opened, options: ReadOptions) -> Source:
+    """Applies the options to a data set that its reader has opened."""
     account = Account()
     names = _choose(path, opened, options, account)
     metadata = dict(opened.metadata)
@@ -237,15 +230,15 @@ def _apply(path: Path, form: str, opened: _Opened, options: ReadOptions) -> Sour
     )
 
 
-def _choose(path: Path, opened: _Opened, options: ReadOptions, account: Account) -> list[str]:
-    """Names of the episodes to read: all, or those that succeeded."""
+def _choose(path: Path, opened: Opened, options: ReadOptions, account: Account) -> list[str]:
+    """Names of the episodes to read: all, or the successful ones."""
     if not options.successful:
         return list(opened.episodes)
     names = []
     for name in opened.episodes:
         try:
             raw = opened.episodes[name]
-        except DataError:  # found again, and reported, when it is read
+        except DataError:  # reported when it is read
             names.append(name)
             continue
         if raw.succeeded is None:
@@ -256,7 +249,7 @@ def _choose(path: Path, opened: _Opened, options: ReadOptions, account: Account)
         else:
             account.add_failure(raw, options)
     if not names:
-        raise DataError(path, None, f"no episode succeeded of {len(opened.episodes)}")
+        raise DataError(path, None, f"none of {len(opened.episodes)} episodes succeeded")
     return names
 
 
@@ -275,7 +268,7 @@ def range_of_actions(episodes: Mapping[str, Episode | RawEpisode], names: Iterab
             each = 0 if actions.ndim == 2 else None
             low = np.minimum(low, actions.min(axis=each)).astype(np.float64)
             high = np.maximum(high, actions.max(axis=each)).astype(np.float64)
-        except (DataError, ValueError):  # found again, and reported, when it is read
+        except (DataError, ValueError):  # reported when it is read
             continue
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         return -1.0, 1.0
@@ -284,27 +277,12 @@ def range_of_actions(episodes: Mapping[str, Episode | RawEpisode], names: Iterab
     return check_bounds((low, high))
 
 
-def _open_robomimic(stack: ExitStack, path: Path, options: ReadOptions, to_train: bool) -> _Opened:
-    episodes = robomimic.open_raw(
-        path, options, extras=["successes"] if to_train else None, attributes=not to_train
-    )
-    return _Opened(
-        episodes=stack.enter_context(episodes),
-        metadata=robomimic.read_metadata(path),
-        prefix="data/",
-        problems=robomimic.find_mask_problems(path),
-        oddities=robomimic.find_oddities(path),
-    )
-
-
-def _open_other(stack: ExitStack, path: Path, form: str, options: ReadOptions) -> _Opened:
+def _open_other(stack: ExitStack, path: Path, form: str, options: ReadOptions) -> Opened:
     reader: Any = {"minari": minari, "d4rl": d4rl, "lerobot": lerobot_reader}[form]
     further = {"horizon": options.horizon} if form == "d4rl" else {}
-    episodes = stack.enter_context(reader.open_raw(path, **further))
-    told = reader.read_metadata(path)
-    if form == "d4rl":  # whose own are below these names
-        told = told["attributes"] | told["metadata"]
-    # As gymnasium's environments are in robomimic's layout.
+    opened: Opened = stack.enter_context(reader.open_data(path, **further))
+    told = opened.metadata
+    # As robomimic's layout describes gymnasium's environments.
     env_args = {"env_name": told.get("dataset_id", path.stem), "type": 2, "env_kwargs": {}}
     kept = {
         key: value
@@ -313,23 +291,19 @@ def _open_other(stack: ExitStack, path: Path, form: str, options: ReadOptions) -
     }
     if form == "minari" and "action_bounds" in told:
         kept["action_bounds"] = told["action_bounds"]
-    return _Opened(
-        episodes=episodes,
-        metadata={**kept, "env_args": env_args},
-        oddities=reader.find_oddities(path, **further),
-    )
+    return replace(opened, metadata={**kept, "env_args": env_args})
 
 
 def _fits_attribute(value: Any) -> bool:
-    """Whether it is a number, a text, or a list of one of both."""
+    """Whether a value is a number, a text, or a list of numbers or of texts."""
     values = value if isinstance(value, list) else [value]
     return any(all(isinstance(x, kind) for x in values) for kind in (str, int | float))
 
 
-def _open_robosuite(stack: ExitStack, path: Path, task: str | None, tracking: float) -> _Opened:
+def _open_robosuite(stack: ExitStack, path: Path, task: str | None, tracking: float) -> Opened:
     if task is None:
         raise ConfigError(
-            f"{path} holds simulator states alone; valid: --task, the task whose scene it is"
+            f"{path} only has simulator states; valid: --task, the task of the recorded scene"
         )
     from torchrl_bmrl.envs.robosuite_names import robosuite_metadata
 
@@ -340,35 +314,11 @@ def _open_robosuite(stack: ExitStack, path: Path, task: str | None, tracking: fl
         kept = {key: value for key, value in vars(episode).items() if key != "left_out"}
         return RawEpisode(**kept)
 
-    return _Opened(
+    return Opened(
         episodes=LazyEpisodes(episodes, read),
         metadata={"env_args": robosuite_metadata(task), "task": task},
         prefix="data/",
     )
-
-
-def join_bounds(bounds: Sequence[Bounds]) -> Bounds:
-    """The narrowest bounds that contain all of the given ones.
-
-    Args:
-        bounds: at least one.
-
-    Raises:
-        ConfigError: if they have different numbers of dimensions.
-
-    Example:
-        >>> join_bounds([(-1.0, 1.0), ((-2.0, 0.0), (0.5, 0.5))])
-        ((-2.0, -1.0), (1.0, 1.0))
-    """
-    arrays: list[list[Any]] = [[np.asarray(end, dtype=float) for end in pair] for pair in bounds]
-    try:
-        low = reduce(np.minimum, [low for low, _ in arrays])
-        high = reduce(np.maximum, [high for _, high in arrays])
-    except ValueError as error:
-        sizes = sorted({end.size for pair in arrays for end in pair if end.ndim})
-        message = f"the actions' bounds have {sizes} dimensions; valid: equally many"
-        raise ConfigError(message) from error
-    return check_bounds((low, high))
 
 
 def with_bounds(sources: Iterable[Source], bounds: Bounds) -> list[Source]:
@@ -389,12 +339,12 @@ def with_joint_range(sources: Sequence[Source]) -> list[Source]:
         return list(sources)
     try:
         return with_bounds(sources, join_bounds([source.bounds for source in sources]))
-    except ConfigError:  # whoever reads the episodes reports actions of different sizes
+    except ConfigError:  # different sizes are reported when the episodes are read
         return list(sources)
 
 
 def _equal(one: Bounds, other: Bounds) -> bool:
-    """Whether bounds are equal, one number for all dimensions or one for each."""
+    """Whether bounds are equal, whether given as one number or as one for each dimension."""
     try:
         return bool(np.all(np.equal(one[0], other[0])) and np.all(np.equal(one[1], other[1])))
     except ValueError:
@@ -402,16 +352,16 @@ def _equal(one: Bounds, other: Bounds) -> bool:
 
 
 def joined(sources: Sequence[Source]) -> Mapping[str, Any]:
-    """Metadata of several sources together: what they agree in, and masks by name.
+    """Metadata that several sources have in common, and their masks joined by name.
 
     Raises:
-        ConfigError: for bounds of actions that differ.
+        ConfigError: for different bounds of the actions.
     """
     first = sources[0]
     if wrong := [source for source in sources if not _equal(source.bounds, first.bounds)]:
         raise ConfigError(
-            f"actions of {wrong[0].path} are bounded by {wrong[0].bounds}, those of {first.path} "
-            f"by {first.bounds}; valid: equal bounds, such as bounds= for all"
+            f"the actions of {wrong[0].path} have bounds {wrong[0].bounds}, those of {first.path} "
+            f"{first.bounds}; valid: equal bounds, such as bounds= for all"
         )
     metadata = {
         key: value
@@ -425,7 +375,7 @@ def joined(sources: Sequence[Source]) -> Mapping[str, Any]:
         positions = {name: start + i for i, name in enumerate(source.episodes)}
         start += len(positions)
         for mask, chosen in source.metadata.get("masks", {}).items():
-            # Of some of the episodes a mask keeps what is left of its own.
+            # A mask keeps those of its episodes that are read.
             masks.setdefault(mask, []).extend(
                 positions[name] for name in chosen if name in positions
             )

@@ -1,4 +1,4 @@
-"""What a data set holds, and everything that is wrong or odd with it."""
+"""Summarises a data set, with all of its faults and oddities."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from torchrl_bmrl.data.schema import Layout, find_problems, layout_of
 from torchrl_bmrl.errors import DataError
 
 SATURATED = 0.999
-"""An action of this size counts as being at its bound."""
+"""An action of this absolute value counts as being at its bound."""
 
 
 @dataclass
 class Extent:
-    """Range of the numbers of an array, in one number for each element of a row.
+    """Range of an array's numbers, for each element of a row.
 
     Attributes:
         dtype: as text.
         low: smallest of each element.
         high: largest of each element.
-        saturated: rows in which each element is at ±1.
+        saturated: number of rows in which each element is at ±1.
     """
 
     dtype: str
@@ -42,7 +42,7 @@ class Extent:
         return cls(str(array.dtype), array.min(0), array.max(0), saturated)
 
     def include(self, other: Extent) -> None:
-        """Widens the range by another episode's."""
+        """Includes the range of another episode."""
         self.low = np.minimum(self.low, other.low)
         self.high = np.maximum(self.high, other.high)
         self.saturated = self.saturated + other.saturated
@@ -50,18 +50,18 @@ class Extent:
 
 @dataclass
 class Summary:
-    """What a data set holds, and everything that is wrong with it.
+    """Content of a data set, its faults, and its oddities.
 
     Attributes:
-        lengths: steps of each whole episode.
+        lengths: number of steps of each sound episode.
         returns: undiscounted sum of rewards of each.
-        successes: whether each succeeded at some step; empty where the file does not say.
+        successes: whether each succeeded at some step; empty if the file does not state it.
         failed: names of those that did not.
         account: what was read, and what was left out.
-        terminated: episodes that end by termination; the others are truncated.
+        terminated: number of episodes that end by termination; the others are truncated.
         ranges: of the actions and of each part of the observation.
-        problems: what keeps the data from being trained on: key and message.
-        warnings: what may be meant, but deserves a look.
+        problems: faults that keep the data from being trained on: key and message of each.
+        warnings: oddities, which may be intended.
     """
 
     lengths: list[int] = field(default_factory=list)
@@ -84,15 +84,15 @@ def summarise(
     options: ReadOptions | None = None,
     look: Callable[[str, Episode | None], object] = lambda name, episode: None,
 ) -> Summary:
-    """Looks at every episode; nothing that is wrong stops it.
+    """Checks every episode, and continues after faults.
 
     Args:
-        episodes: by name; reading one may raise a DataError, which becomes a problem.
+        episodes: by name; a DataError on reading one becomes a problem.
         prefix: of the names, for messages.
         bounds: of floating-point actions; ``None`` for any.
-        account: what is left out already; the episodes are added to it.
-        options: by which the episodes are read.
-        look: called with every name and its episode, ``None`` where it cannot be read.
+        account: of what is left out so far; the episodes are added to it.
+        options: how the episodes are read.
+        look: called with every name and its episode, or ``None`` if it cannot be read.
     """
     summary = Summary(account=account or Account())
     layout: Layout | None = None
@@ -132,7 +132,7 @@ def summarise(
 
 
 def is_continuous(episode: Episode) -> bool:
-    """Whether each next observation is the following step's observation."""
+    """Whether each next observation equals the observation of the following step."""
     return all(
         np.array_equal(episode.next_observations[name][:-1], part[1:])
         for name, part in episode.observations.items()
@@ -150,7 +150,7 @@ def _add(summary: Summary, name: str, episode: Episode) -> None:
 
 
 def _add_ranges(summary: Summary, episode: Episode) -> None:
-    """Includes what can be compared, even where it is out of range, which the ranges then show."""
+    """Includes all comparable arrays, even those out of bounds, so that the ranges show it."""
     for name, array in {"actions": episode.actions, **episode.observations}.items():
         if array.dtype.kind not in "biuf" or not array.ndim or 0 in array.shape:
             continue
@@ -175,7 +175,7 @@ def _warnings(summary: Summary, bounds: Bounds | None) -> Iterator[str]:
     if count > 1 and summary.terminated == count and len(set(summary.lengths)) == 1:
         yield (
             f"all {count} episodes terminate after exactly {summary.lengths[0]} steps: is that a "
-            "horizon? A horizon truncates, and values bootstrap through it"
+            "horizon? A horizon truncates, and values are bootstrapped after it"
         )
     for key, extent in summary.ranges.items():
         constant = np.flatnonzero(extent.low == extent.high)
@@ -185,11 +185,11 @@ def _warnings(summary: Summary, bounds: Bounds | None) -> Iterator[str]:
     if actions is None or not actions.dtype.startswith("float"):
         return
     share = np.ravel(actions.saturated / max(1, steps))
-    # A dimension that is nowhere else has two commands, such as a gripper's.
+    # A dimension that is always there has two commands, such as a gripper's.
     for i in np.flatnonzero((share > 0.5) & (share < 1)):
         yield f"actions: dimension {i} is at ±1 in {share[i]:.0%} of all steps"
     if bounds is None and (np.min(actions.low) < -1 or np.max(actions.high) > 1):
-        yield "actions: outside [-1, 1]; tell the loss its bounds"
+        yield "actions: outside [-1, 1]; give the loss their bounds"
 
 
 def _dimensions(index: np.ndarray, size: int) -> str:
@@ -202,12 +202,12 @@ def _dimensions(index: np.ndarray, size: int) -> str:
 def _repeats(seen: Mapping[str, list[str]]) -> Iterator[str]:
     for names in seen.values():
         if len(names) > 1:
-            yield f"the same episode {len(names)} times: {', '.join(names[:8])}"
+            yield f"the same episode occurs {len(names)} times: {', '.join(names[:8])}"
 
 
 def _jumps(names: list[str]) -> Iterator[str]:
     if names:
         yield (
-            f"next observations are not the following steps' observations in {len(names)} "
+            f"next observations differ from the following steps' observations in {len(names)} "
             f"episodes, such as {names[0]}: are their steps in order?"
         )
