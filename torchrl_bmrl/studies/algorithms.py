@@ -57,35 +57,35 @@ def make_critics(
     return [make_qvalue_network(observation_dim, action_dim, num_cells=cells) for _ in range(2)]
 
 
-def bc(*dims: int, cells: Sequence[int] = CELLS) -> Algorithm:
+def bc(observation_dim: int, action_dim: int, cells: Sequence[int] = CELLS) -> Algorithm:
     """Behaviour cloning with the squared error."""
     # TorchRL's BCLoss has no targets and warns about it.
     warnings.filterwarnings("ignore", "The name target_actor_network_params wasn't part of")
-    actor = make_actor(*dims, cells)
+    actor = make_actor(observation_dim, action_dim, cells)
     return BCLoss(actor), actor
 
 
-def td3_bc(*dims: int, cells: Sequence[int] = CELLS) -> Algorithm:
+def td3_bc(observation_dim: int, action_dim: int, cells: Sequence[int] = CELLS) -> Algorithm:
     """TD3 with an imitation term."""
-    actor = make_actor(*dims, cells)
-    critics = make_critics(*dims, cells)
+    actor = make_actor(observation_dim, action_dim, cells)
+    critics = make_critics(observation_dim, action_dim, cells)
     return TD3BCLoss(actor, critics, bounds=(-1.0, 1.0), loss_function="l2"), actor
 
 
-def iql(*dims: int, cells: Sequence[int] = CELLS) -> Algorithm:
+def iql(observation_dim: int, action_dim: int, cells: Sequence[int] = CELLS) -> Algorithm:
     """Expectile values and advantage-weighted imitation."""
-    mean = make_actor(*dims, cells).module
-    network = nn.Sequential(mean, AddStateIndependentNormalScale(dims[1]))
+    mean = make_actor(observation_dim, action_dim, cells).module
+    network = nn.Sequential(mean, AddStateIndependentNormalScale(action_dim))
     keys = ["loc", "scale"]
     network = TensorDictModule(network, in_keys=["observation"], out_keys=keys)
     actor = ProbabilisticActor(network, in_keys=keys, distribution_class=IndependentNormal)
-    value = make_mlp(dims[0], 1, cells)
+    value = make_mlp(observation_dim, 1, cells)
     value = TensorDictModule(value, in_keys=["observation"], out_keys=["state_value"])
     options = {"temperature": 3.0, "expectile": 0.7, "loss_function": "l2"}
-    return IQLLoss(actor, make_critics(*dims, cells), value, **options), actor
+    return IQLLoss(actor, make_critics(observation_dim, action_dim, cells), value, **options), actor
 
 
-def cql(*dims: int, cells: Sequence[int] = CELLS) -> Algorithm:
+def cql(observation_dim: int, action_dim: int, cells: Sequence[int] = CELLS) -> Algorithm:
     """SAC with a penalty on the critics' values of actions that the data does not contain.
 
     The fixed weight of 5 is the published one without a Lagrange multiplier. TorchRL's
@@ -95,7 +95,7 @@ def cql(*dims: int, cells: Sequence[int] = CELLS) -> Algorithm:
     actor = ProbabilisticActor(
         TensorDictSequential(
             TensorDictModule(
-                make_mlp(dims[0], 2 * dims[1], cells), ["observation"], ["parameters"]
+                make_mlp(observation_dim, 2 * action_dim, cells), ["observation"], ["parameters"]
             ),
             TensorDictModule(NormalParamExtractor(), ["parameters"], ["loc", "scale"]),
         ),
@@ -104,10 +104,10 @@ def cql(*dims: int, cells: Sequence[int] = CELLS) -> Algorithm:
     )
     loss = CQLLoss(
         actor,
-        make_critics(*dims, cells),
+        make_critics(observation_dim, action_dim, cells),
         min_q_weight=5.0,
         num_random=10,
-        target_entropy=-float(dims[1]),
+        target_entropy=-float(action_dim),
         loss_function="l2",
     )
     return loss, actor

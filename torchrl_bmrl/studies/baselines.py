@@ -135,11 +135,11 @@ class Learner:
         torch.manual_seed(run.seed("baselines", self.name))
         if algorithm == ONE_HOT:
             sizes["observation_dim"] += len(run.names)
-            self.loss, self.actor = make_bcq_loss(**loss_options(bcq), **sizes), None
+            self.loss, self.actor = make_bcq_loss(**(loss_options(bcq) | sizes)), None
             networks = ["generator", "qvalue_network"]
             networks += ["perturbation_network"] if bcq.perturbation else []
         else:
-            self.loss, self.actor = ALGORITHMS[algorithm](*sizes.values(), cells=bcq.num_cells)
+            self.loss, self.actor = ALGORITHMS[algorithm](**sizes, cells=bcq.num_cells)
             if algorithm != "bc":
                 self.loss.make_value_estimator(gamma=bcq.gamma)
             networks = list(OBJECTIVES[algorithm])
@@ -202,8 +202,14 @@ class Learner:
         settings = self.run.settings
         metadata = {"kind": "baseline", "name": self.name, "updates": update}
         metadata |= {"settings": settings.deciding()}
-        options = {"device": settings.device, "keep": settings.keep_checkpoints}
-        keep_training(self.path, self.loss, self.optimizers, metadata, **options)
+        keep_training(
+            self.path,
+            self.loss,
+            self.optimizers,
+            metadata,
+            device=settings.device,
+            keep=settings.keep_checkpoints,
+        )
 
 
 def make_buffer(run: Run, algorithm: str, task: str) -> ReplayBuffer:
@@ -216,8 +222,10 @@ def make_buffer(run: Run, algorithm: str, task: str) -> ReplayBuffer:
                 transform = Compose(*one_hot_task(index, len(run.names)))
                 data = transform(data.copy()).set("next", transform(data["next"].copy()))
             datasets.append(data)
-    options = {"batch_size": run.settings.bcq.batch_size, "device": run.settings.device}
-    return make_multi_task_replay_buffer(datasets, **options)
+    settings = run.settings
+    return make_multi_task_replay_buffer(
+        datasets, batch_size=settings.bcq.batch_size, device=settings.device
+    )
 
 
 def train_job(job: tuple[Run, tuple[str, str, int]], report: Report) -> None:

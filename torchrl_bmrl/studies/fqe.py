@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -33,7 +33,7 @@ from torchrl_bmrl.training.checkpoint import save_checkpoint
 from torchrl_bmrl.training.fit import Every, fit
 from torchrl_bmrl.training.update import keep_freed_memory
 
-COLUMNS = {
+COLUMNS: dict[str, Callable[[str], Any]] = {
     "task": str,
     "updates": whole,
     "estimate": finite,

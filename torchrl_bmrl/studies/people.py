@@ -16,15 +16,17 @@ from torchrl_bmrl.data.demonstrations import read_demonstrations
 from torchrl_bmrl.envs.transforms import transform_data
 from torchrl_bmrl.errors import ConfigError, UnknownNameError
 from torchrl_bmrl.evaluation import bootstrap_interval
-from torchrl_bmrl.files import finite, read_rows, whole, write_rows
+from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
+from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.pipeline.collect import collect
+from torchrl_bmrl.pipeline.evaluate import keep_rows
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.stage1 import sizes_of, train_agents
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
 from torchrl_bmrl.reports.tables import MISSING, Table
-from torchrl_bmrl.run.folder import open_run
+from torchrl_bmrl.run.locks import hold_run
 from torchrl_bmrl.run.progress import progress
 from torchrl_bmrl.run.settings import setting
 from torchrl_bmrl.run.workers import Report
@@ -33,13 +35,6 @@ log = logging.getLogger(__name__)
 
 Job = tuple[Run, tuple[float, int]]
 """The run of the task alone, the human share and the training seed."""
-COLUMNS = {
-    "share": finite,
-    "training_seed": whole,
-    "episode": whole,
-    "return": finite,
-    "success": lambda text: whole(text) if text else None,
-}
 
 
 @dataclass
@@ -74,41 +69,36 @@ def learn_from_people(run: Run, settings: HumanSettings) -> str:
         raise ConfigError("human.path is empty; valid: a file or folder with demonstrations")
     if settings.task not in run.names:
         raise UnknownNameError("human.task", settings.task, run.names)
-    # More shares and seeds may join the finished ones, with the same demonstrations.
-    held = {name: getattr(settings, name) for name in ("path", "task", "tracking")}
-    open_run(run.folder / "human", held)
-    human = run.folder / "human" / "demonstrations.hdf5"
-    if not human.exists():
-        raw = find_format(Path(settings.path)) == "robosuite"
-        options = {"task": settings.task, "tracking": settings.tracking} if raw else {}
-        with progress(None, "converting", "episode") as bar:
-            done = convert(settings.path, human, to="robomimic", report=bar.update, **options)
-        for note in done.notes:
-            log.warning("%s: %s", settings.path, note)
-    tasks = run.settings.tasks
-    i = run.names.index(settings.task)
-    tasks = {settings.task: tasks[settings.task]} if isinstance(tasks, Mapping) else [tasks[i]]
-    folder = str(run.folder / "human" / "run")
     shares = [0.0, *(share for share in settings.shares if share)]
     agents = [(share, seed) for share in shares for seed in range(settings.training_seeds)]
     bcq, evaluate = run.settings.bcq, run.settings.evaluate
-    with Run(replace(run.settings, run_dir=folder, base=None, tasks=tasks)) as alone:
-        alone.check_playable()
-        collect(alone)
-        alone.jobs(
-            train_job,
-            agents,
-            total=bcq.epochs * bcq.updates_per_epoch * len(agents),
-            description="training BCQ",
-            unit="update",
-        )
-        parts = alone.jobs(
-            evaluate_job,
-            agents,
-            total=evaluate.episodes * alone.horizon(alone.tasks[0]) * len(agents),
-            description="evaluating",
-            unit="step",
-        )
+    folder, tasks = run.folder / "human", run.settings.tasks
+    if isinstance(tasks, Mapping):
+        tasks = {settings.task: tasks[settings.task]}
+    else:
+        tasks = [tasks[run.names.index(settings.task)]]
+    alone = Run(replace(run.settings, run_dir=str(folder / "run"), base=None, tasks=tasks))
+    alone.check_playable()
+    # More shares and seeds may join the finished ones, with the same demonstrations.
+    held = {name: getattr(settings, name) for name in ("path", "task", "tracking")}
+    with hold_run(folder, held):
+        _convert(settings, folder / "demonstrations.hdf5")
+        with alone:
+            collect(alone)
+            alone.jobs(
+                train_job,
+                agents,
+                total=bcq.epochs * bcq.updates_per_epoch * len(agents),
+                description="training BCQ",
+                unit="update",
+            )
+            parts = alone.jobs(
+                evaluate_job,
+                agents,
+                total=evaluate.episodes * alone.horizon(alone.tasks[0]) * len(agents),
+                description="evaluating",
+                unit="step",
+            )
     rows = [row for part in parts for row in part]
     write_rows(run.folder / "human.csv", rows)
     table = make_table(rows, run.titles[settings.task])
@@ -117,8 +107,22 @@ def learn_from_people(run: Run, settings: HumanSettings) -> str:
     return table.markdown()
 
 
-def _agent_name(task: str, share: float, seed: int) -> str:
-    return f"{task}-human{share:g}-{seed}"
+def _convert(settings: HumanSettings, path: Path) -> None:
+    """Writes the human demonstrations in robomimic's layout, if the file is not there."""
+    if path.exists():
+        return
+    raw = find_format(Path(settings.path)) == "robosuite"
+    with progress(None, "converting", "episode") as bar:
+        done = convert(
+            settings.path,
+            path,
+            to="robomimic",
+            task=settings.task if raw else None,
+            tracking=settings.tracking if raw else 1.0,
+            report=bar.update,
+        )
+    for note in done.notes:
+        log.warning("%s: %s", settings.path, note)
 
 
 def train_job(job: Job, report: Report) -> None:
@@ -134,33 +138,30 @@ def train_job(job: Job, report: Report) -> None:
         batch_size=run.settings.bcq.batch_size,
         device=run.settings.device,
     )
-    agents = {_agent_name(task.name, share, seed): task.name}
+    agents = {f"{task.name}-human{share:g}-{seed}": task.name}
     train_agents(run, agents, buffer, report, sizes=sizes_of(scripted))
 
 
 def evaluate_job(job: Job, report: Report) -> list[dict[str, Any]]:
-    """Episodes of one agent, played once."""
+    """Episodes of one agent."""
     run, (share, seed) = job
-    (task,), settings = run.tasks, run.settings.evaluate
-    name = _agent_name(task.name, share, seed)
-    path = run.agent_path(name).with_name("results.csv")
-    if path.exists():
-        report(settings.episodes * run.horizon(task))
-    else:
-        policy = BCQPolicy.frozen(run.teacher(name), num_candidates=settings.num_candidates)
-        seeds = [run.seed("evaluate", task.name, i) for i in range(settings.episodes)]
-        rows = [
-            {
-                "share": share,
-                "training_seed": seed,
-                "episode": i,
-                "return": outcome.episode_return,
-                "success": "" if outcome.success is None else int(outcome.success),
-            }
-            for i, outcome in enumerate(run.play(task, policy, seeds=seeds, report=report))
-        ]
-        write_rows(path, rows)
-    return read_rows(path, COLUMNS)
+    (task,), policy = run.tasks, f"human{share:g}-{seed}"
+
+    def play(seeds: list[int]) -> list[EpisodeOutcome]:
+        count = run.settings.evaluate.num_candidates
+        agent = BCQPolicy.frozen(run.teacher(f"{task.name}-{policy}"), num_candidates=count)
+        return run.play(task, agent, seeds=seeds, report=report)
+
+    return [
+        {
+            "share": share,
+            "training_seed": seed,
+            "episode": row.episode,
+            "success": "" if row.success is None else int(row.success),
+            "return": row.episode_return,
+        }
+        for row in keep_rows(run, task.name, policy, play, report=report)
+    ]
 
 
 def make_table(rows: Sequence[Mapping[str, Any]], title: str) -> Table:
@@ -177,7 +178,7 @@ def make_table(rows: Sequence[Mapping[str, Any]], title: str) -> Table:
     lines, without = [], np.array(column(0.0, "return"))
     for share in dict.fromkeys(row["share"] for row in rows):
         returns, successes = np.array(column(share, "return")), column(share, "success")
-        success = MISSING if None in successes else f"{sum(successes)} of {len(successes)}"
+        success = MISSING if "" in successes else f"{sum(successes)} of {len(successes)}"
         line = [f"{share:.0%}", f"{returns.mean():.1f}", success]
         if share == 0:
             lines.append((*line, "", "", ""))
