@@ -1,1 +1,1 @@
-"""Studies: experiments on a run of the two stages, each a function of the run and its settings."""
+"""Studies on a run: each is a function of the open run and its own settings."""
