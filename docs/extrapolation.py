@@ -321,7 +321,10 @@ def parse(words: Sequence[str] | None = None) -> Namespace:
         parser.add_argument(flag, type=positive, default=default, help=f"{what} ({default})")
     options = parser.parse_args(words)
     if options.exploration_steps >= options.behaviour_steps:
-        parser.error(f"exploration steps: {options.exploration_steps}; valid: fewer than all")
+        parser.error(
+            f"--exploration-steps is {options.exploration_steps}; valid: fewer than "
+            f"{options.behaviour_steps}, the behaviour's steps"
+        )
     options.run_dir = options.run_dir or f"runs/extrapolation-{options.env}"
     return options
 
