@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,56 +18,69 @@ pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 pytest.importorskip("robosuite", exc_type=ImportError)
 
-from omegaconf import OmegaConf
-from small_runs import HORIZON, RECIPES, configured
+from small_runs import TASKS, Interruption, contents
 from tensordict import TensorDict
+from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl.envs.transforms import Compose
 
-from torchrl_bmrl import names
-from torchrl_bmrl.evaluation import ResultRow, read_results, rollout, write_results
-from torchrl_bmrl.pipeline.agents import ACTION_DIM, OBSERVATION_DIM
-from torchrl_bmrl.run.workers import derive_seed
+from torchrl_bmrl.errors import BMRLError, StoppedError
+from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
+from torchrl_bmrl.pipeline import (
+    BCQSettings,
+    CollectSettings,
+    EvaluateSettings,
+    Run,
+    Settings,
+    collect,
+)
+from torchrl_bmrl.pipeline import run as run_module
+from torchrl_bmrl.run.settings import check_settings
+from torchrl_bmrl.studies.baselines import (
+    ALL_TASKS,
+    BASELINES,
+    BaselineSettings,
+    Learner,
+    baselines,
+    make_buffer,
+    make_table,
+    one_hot_task,
+    train_job,
+)
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 pytestmark = pytest.mark.robosuite
 
-ALGORITHMS = ["bc", "td3_bc", "iql", "cql", "bcq_one_hot"]
-TASKS = ["reach", "lift"]
-SMALL = [
-    "preset=smoke",
-    "workers=1",
-    f"tasks=[{','.join(TASKS)}]",
-    "collect.train_episodes.reach=1",
-    "collect.train_episodes.lift=1",
-    "bcq.epochs=2",
-    "bcq.updates_per_epoch=6",
-    "bcq.batch_size=8",
-    "bcq.num_cells=[16,16]",
-    "evaluate.episodes=2",
-    "evaluate.num_candidates=5",
-    "log_interval=4",
-    "checkpoint_interval=4",
-]
+OBSERVATION_DIM, ACTION_DIM = 33, 7
+
+
+def make_run(folder: Path, **bcq: Any) -> Run:
+    bcq = {"epochs": 2, "updates_per_epoch": 6, "batch_size": 8, "num_cells": [16, 16]} | bcq
+    return Run(
+        Settings(
+            run_dir=str(folder),
+            workers=1,
+            tasks=TASKS,
+            log_interval=4,
+            checkpoint_interval=4,
+            collect=CollectSettings(train_episodes={"default": 1}, valid_episodes=1),
+            bcq=BCQSettings(**bcq),
+            evaluate=EvaluateSettings(episodes=2, num_candidates=5),
+        )
+    )
 
 
 @pytest.fixture(scope="module")
-def baselines() -> Iterator[Any]:
-    """The recipe's module, with episodes of ten steps."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(RECIPES))
-        patch.setattr(names, "HORIZON", HORIZON)
-        patch.setitem(rollout.evaluate_policy.__kwdefaults__, "max_steps", HORIZON)
-        import baselines
-
-        yield baselines
+def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder with demonstrations and nothing else."""
+    folder = tmp_path_factory.mktemp("collected")
+    with make_run(folder) as run:
+        collect(run)
+    return folder
 
 
-def settings(folder: Path, *overrides: str) -> Any:
-    return configured(*SMALL, f"run_dir={folder}", *overrides)
-
-
-def make_learner(baselines: Any, folder: Path, algorithm: str, *overrides: str) -> Any:
-    config = OmegaConf.to_object(settings(folder, *overrides))
-    return baselines.Learner(config, algorithm, "all" if "one_hot" in algorithm else "lift")
+def make_learner(folder: Path, algorithm: str, **bcq: Any) -> Learner:
+    task = ALL_TASKS if algorithm == "bcq_one_hot" else "lift"
+    return Learner(make_run(folder, **bcq), algorithm, task)
 
 
 ACTION = torch.linspace(-0.6, 0.6, ACTION_DIM)
@@ -76,7 +88,7 @@ ACTION = torch.linspace(-0.6, 0.6, ACTION_DIM)
 
 def one_action(rows: int, algorithm: str, seed: int = 0) -> TensorDict:
     """A demonstrator that always does the same, but for noise, and is rewarded for it."""
-    size = OBSERVATION_DIM + (len(TASKS) if "one_hot" in algorithm else 0)
+    size = OBSERVATION_DIM + (len(TASKS) if algorithm == "bcq_one_hot" else 0)
     generator = torch.Generator().manual_seed(seed)
     now, after = (torch.randn(rows, size, generator=generator) for _ in range(2))
     action = ACTION + 0.4 * torch.randn(rows, ACTION_DIM, generator=generator)
@@ -89,7 +101,7 @@ def one_action(rows: int, algorithm: str, seed: int = 0) -> TensorDict:
     return TensorDict(data, [rows])
 
 
-def networks(learner: Any) -> dict[str, torch.Tensor]:
+def networks(learner: Learner) -> dict[str, torch.Tensor]:
     """Every network's parameters in one vector, by name."""
     return {
         name.removesuffix("_params"): torch.cat([x.flatten() for x in part.values(True, True)])
@@ -103,14 +115,12 @@ def networks(learner: Any) -> dict[str, torch.Tensor]:
 # -- what an update moves --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_an_update_moves_every_network_and_every_target(
-    baselines: Any, tmp_path: Path, algorithm: str
-) -> None:
-    learner = make_learner(baselines, tmp_path, algorithm)
-    before, choose = networks(learner), learner.choose_updates(100)
-    for number in (99, 100):
-        choose(number)(one_action(8, algorithm))
+@pytest.mark.parametrize("algorithm", BASELINES)
+def test_an_update_moves_every_network_and_every_target(collected: Path, algorithm: str) -> None:
+    learner = make_learner(collected, algorithm)
+    before, step = networks(learner), learner.make_step(100)
+    for update in (99, 100):
+        step(update, one_action(8, algorithm))
     after = networks(learner)
     assert {name for name in before if torch.equal(before[name], after[name])} == set()
     expected = {
@@ -130,34 +140,30 @@ def test_an_update_moves_every_network_and_every_target(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_a_policy_comes_to_do_what_the_demonstrator_does(
-    baselines: Any, tmp_path: Path, algorithm: str
-) -> None:
-    learner = make_learner(baselines, tmp_path, algorithm, "bcq.lr=0.003", "bcq.gamma=0")
+@pytest.mark.parametrize("algorithm", BASELINES)
+def test_a_policy_comes_to_do_what_the_demonstrator_does(collected: Path, algorithm: str) -> None:
+    learner = make_learner(collected, algorithm, lr=0.003, gamma=0.0)
     total = {"td3_bc": 600}.get(algorithm, 200)
-    choose, states = learner.choose_updates(total), one_action(64, algorithm).select("observation")
+    step, states = learner.make_step(total), one_action(64, algorithm).select("observation")
 
     def error() -> float:
-        with baselines.set_exploration_type(baselines.ExplorationType.DETERMINISTIC):
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
             action = learner.make_policy()(states.copy())["action"]
         return (action - ACTION).square().mean().item()
 
     before = error()
     assert error() == pytest.approx(before, rel=0.2)  # without noise, but for BCQ's proposals
-    for number in range(1, total + 1):
-        choose(number)(one_action(128, algorithm, seed=number))
+    for update in range(1, total + 1):
+        step(update, one_action(128, algorithm, seed=update))
     assert error() < 0.25 * before
 
 
-def test_td3_bc_moves_its_actor_and_targets_at_every_other_update(
-    baselines: Any, tmp_path: Path
-) -> None:
-    learner = make_learner(baselines, tmp_path, "td3_bc")
-    choose, moved = learner.choose_updates(100), []
-    for number in (1, 2, 3):
+def test_td3_bc_moves_its_actor_and_targets_at_every_other_update(collected: Path) -> None:
+    learner = make_learner(collected, "td3_bc")
+    step, moved = learner.make_step(100), []
+    for update in (1, 2, 3):
         before = networks(learner)
-        choose(number)(one_action(8, "td3_bc"))
+        step(update, one_action(8, "td3_bc"))
         after = networks(learner)
         moved.append({name for name in before if not torch.equal(before[name], after[name])})
     assert moved[0] == moved[2] == {"qvalue_network"}
@@ -165,25 +171,25 @@ def test_td3_bc_moves_its_actor_and_targets_at_every_other_update(
 
 
 def test_cql_imitates_in_the_first_twenty_fifth_of_its_updates(
-    baselines: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    collected: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    learner = make_learner(baselines, tmp_path, "cql")
+    learner = make_learner(collected, "cql")
     imitation, calls = learner.loss.actor_bc_loss, []
     monkeypatch.setattr(
         learner.loss, "actor_bc_loss", lambda data: calls.append(data) or imitation(data)
     )
-    choose, counts = learner.choose_updates(100), []
-    for number in (1, 4, 5, 100):
-        choose(number)(one_action(8, "cql"))
+    step, counts = learner.make_step(100), []
+    for update in (1, 4, 5, 100):
+        step(update, one_action(8, "cql"))
         counts.append(len(calls))
     assert counts == [1, 2, 2, 2]
 
 
 def test_cqls_candidates_differ_within_a_state(
-    baselines: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    collected: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A TorchRL loss turns sampling off in its methods; CQL would compare ten times the same action.
-    learner = make_learner(baselines, tmp_path, "cql")
+    learner = make_learner(collected, "cql")
     draw, drawn = learner.loss._get_policy_actions, []
 
     def recorded(*args: Any, **kwargs: Any) -> Any:
@@ -191,7 +197,7 @@ def test_cqls_candidates_differ_within_a_state(
         return drawn[-1]
 
     monkeypatch.setattr(learner.loss, "_get_policy_actions", recorded)
-    learner.choose_updates(100)(100)(one_action(8, "cql"))
+    learner.make_step(100)(100, one_action(8, "cql"))
     assert len(drawn) == 2  # at the states and at the next ones
     for data, _ in drawn:
         actions = data["action"].reshape(8, 10, ACTION_DIM)
@@ -201,22 +207,20 @@ def test_cqls_candidates_differ_within_a_state(
 
 
 @pytest.mark.parametrize("algorithm", ["td3_bc", "iql", "cql", "bcq_one_hot"])
-def test_the_discount_is_that_of_stage_1(baselines: Any, tmp_path: Path, algorithm: str) -> None:
-    learner = make_learner(baselines, tmp_path, algorithm, "bcq.gamma=0.5")
+def test_the_discount_is_that_of_stage_1(collected: Path, algorithm: str) -> None:
+    learner = make_learner(collected, algorithm, gamma=0.5)
     assert learner.loss.value_estimator.gamma.item() == 0.5
 
 
 # -- the task's index ------------------------------------------------------------------------------
 
 
-def test_one_hot_bcq_acts_differently_in_the_same_state_for_another_task(
-    baselines: Any, tmp_path: Path
-) -> None:
-    policy = make_learner(baselines, tmp_path, "bcq_one_hot").make_policy()
+def test_one_hot_bcq_acts_differently_in_the_same_state_for_another_task(collected: Path) -> None:
+    policy = make_learner(collected, "bcq_one_hot").make_policy()
     seen, done = [], []
     for index in range(2):
         data = TensorDict({"observation": torch.ones(5, OBSERVATION_DIM)}, [5])
-        seen.append(baselines.Compose(*baselines.one_hot_task(index, 2))(data))
+        seen.append(Compose(*one_hot_task(index, 2))(data))
         torch.manual_seed(0)  # the same latents
         done.append(policy(seen[-1].copy())["action"])
     assert [data["observation"][0, -2:].tolist() for data in seen] == [[1, 0], [0, 1]]
@@ -227,29 +231,9 @@ def test_one_hot_bcq_acts_differently_in_the_same_state_for_another_task(
 # -- whole runs ------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def collected(baselines: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run folder with demonstrations and nothing else."""
-    import collect
-
-    folder = tmp_path_factory.mktemp("collected")
-    collect.collect(OmegaConf.to_object(settings(folder)))
-    return folder
-
-
-def run(baselines: Any, folder: Path, *overrides: str) -> None:
-    baselines.run_recipe(settings(folder, *overrides), baselines.baselines)
-
-
-def contents(folder: Path, *patterns: str) -> dict[str, bytes]:
-    paths = [path for pattern in patterns for path in folder.glob(pattern) if path.is_file()]
-    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
-
-
 @pytest.mark.slow
-def test_one_hot_bcq_learns_from_every_task_with_its_index(baselines: Any, collected: Path) -> None:
-    buffer = baselines.make_buffer(OmegaConf.to_object(settings(collected)), "bcq_one_hot", "all")
-    batch = buffer.sample()
+def test_one_hot_bcq_learns_from_every_task_with_its_index(collected: Path) -> None:
+    batch = make_buffer(make_run(collected), "bcq_one_hot", ALL_TASKS).sample()
     assert batch.batch_size == (2, 8)
     for data in (batch, batch["next"]):
         index = data["observation"][..., OBSERVATION_DIM:]
@@ -258,75 +242,65 @@ def test_one_hot_bcq_learns_from_every_task_with_its_index(baselines: Any, colle
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-@pytest.mark.parametrize(("update", "kept"), [(3, None), (7, 4), (11, 8), (12, 12)])
+@pytest.mark.parametrize("algorithm", BASELINES)
+@pytest.mark.parametrize(
+    ("error", "update", "kept"),
+    [(KeyboardInterrupt, 3, 0), (KeyboardInterrupt, 7, 4), (StoppedError, 7, 7)],
+)
 def test_training_resumed_equals_never_stopped(
-    baselines: Any, collected: Path, tmp_path: Path, algorithm: str, update: int, kept: int | None
+    collected: Path,
+    tmp_path: Path,
+    algorithm: str,
+    error: type[BaseException],
+    update: int,
+    kept: int,
 ) -> None:
-    task = "all" if algorithm == "bcq_one_hot" else "lift"
+    task = ALL_TASKS if algorithm == "bcq_one_hot" else "lift"
     jobs = []
     for name in ("whole", "stopped"):
         shutil.copytree(collected / "data", tmp_path / name / "data")
-        jobs.append((OmegaConf.to_object(settings(tmp_path / name)), algorithm, task))
-    done = 0
-
-    def stop(count: int) -> None:
-        nonlocal done
-        done += count
-        if done == update:
-            raise KeyboardInterrupt
-
-    baselines.train_job(jobs[0], lambda _: None)
-    with pytest.raises(KeyboardInterrupt):
-        baselines.train_job(jobs[1], stop)
-    checkpoint = (
-        tmp_path / "stopped" / "baselines" / f"{algorithm}-{task}" / "checkpoint.safetensors"
-    )
-    assert checkpoint.exists() == (kept is not None)
-    if kept is not None:
-        assert load_checkpoint(checkpoint, kind="baseline")[1]["updates"] == kept
+        jobs.append((make_run(tmp_path / name), (algorithm, task, 12)))
+    train_job(jobs[0], lambda _: None)
+    with pytest.raises(error):
+        train_job(jobs[1], Interruption(update, error))
+    newest = f"baselines/{algorithm}-{task}/checkpoint.safetensors"
+    assert (tmp_path / "stopped" / newest).exists() == bool(kept)
+    if kept:
+        assert load_checkpoint(tmp_path / "stopped" / newest, kind="baseline")[1]["updates"] == kept
     counted: list[int] = []
-    baselines.train_job(jobs[1], counted.append)
-    assert counted == ([kept] if kept else []) + [1] * (12 - (kept or 0))
-    expected = contents(tmp_path / "whole", "baselines/**/*")
-    assert len(expected) == 2  # the newest, and the one before
-    assert contents(tmp_path / "stopped", "baselines/**/*") == expected
+    train_job(jobs[1], counted.append)
+    assert counted == ([kept] if kept else []) + [1] * (12 - kept)
+    assert contents(tmp_path / "stopped", newest) == contents(tmp_path / "whole", newest)
 
 
 @pytest.mark.slow
-def test_every_baseline_plays_the_evaluations_starts_and_a_repeated_command_redoes_nothing(
-    baselines: Any,
-    collected: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+def test_every_baseline_plays_the_evaluations_starts_and_a_repeated_call_redoes_nothing(
+    collected: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import evaluate
-
     folder = Path(shutil.copytree(collected, tmp_path / "run"))
     stage_1 = ResultRow(
         task="lift", policy="bcq", seed=0, episode=0, episode_return=7.5, success=True
     )
     write_results(folder / "results.csv", [stage_1])
     before = (folder / "results.csv").read_bytes()
-    played: list[tuple[Any, list[int]]] = []
-    plain: Callable[..., Any] = evaluate.evaluate_policy
+    played: list[tuple[int, list[int]]] = []
+    evaluate_policy = run_module.evaluate_policy
 
     def recorded(env: Any, policy: Any, seeds: list[int], **options: Any) -> Any:
-        played.append((env.observation_spec["observation"].shape, seeds))
-        return plain(env, policy, seeds, **options)
+        played.append((env.observation_spec["observation"].shape[-1], seeds))
+        return evaluate_policy(env, policy, seeds, **options)
 
-    monkeypatch.setattr(evaluate, "evaluate_policy", recorded)
-    run(baselines, folder, "baselines.algorithms=[bc,iql]")
-    run(baselines, folder)  # others join
-    starts = {task: [derive_seed(0, "evaluate", task, i) for i in range(2)] for task in TASKS}
-    assert [seeds for _, seeds in played] == list(starts.values()) * len(ALGORITHMS)
-    sizes = [shape[-1] - OBSERVATION_DIM for shape, _ in played]
-    assert sizes == [0] * 8 + [2, 2]
+    monkeypatch.setattr(run_module, "evaluate_policy", recorded)
+    with make_run(folder) as run:
+        baselines(run, BaselineSettings(algorithms=["bc", "iql"]))
+        text = baselines(run, BaselineSettings())  # others join
+        starts = [[run.seed("evaluate", task, i) for i in range(2)] for task in TASKS]
+    assert [seeds for _, seeds in played] == starts * len(BASELINES)
+    assert [size - OBSERVATION_DIM for size, _ in played] == [0] * 8 + [2, 2]
 
     rows = read_results(folder / "baselines.csv")
     assert [(row.policy, row.task, row.episode) for row in rows] == [
-        (name, task, i) for name in ALGORITHMS for task in TASKS for i in range(2)
+        (name, task, i) for name in BASELINES for task in TASKS for i in range(2)
     ]
     assert len({row.episode_return for row in rows if row.task == "lift"}) > 4  # other policies
     assert read_results(folder / "evaluation" / "lift-cql.csv") == [
@@ -337,7 +311,7 @@ def test_every_baseline_plays_the_evaluations_starts_and_a_repeated_command_redo
     assert lines[1] == 'BCQ,–,"7.5, 100%",100%,"[100%, 100%]",1'
     assert [line.split(",")[0] for line in lines[2:6]] == ["BC", "TD3+BC", "IQL", "CQL"]
     assert (folder / "studies" / "baselines.json").exists()
-    assert "12 updates each" in capsys.readouterr().out
+    assert "12 updates each" in text
     assert (folder / "results.csv").read_bytes() == before
 
     kept = "baselines.csv", "tables/*", "studies/*", "evaluation/*", "baselines/**/*"
@@ -345,21 +319,53 @@ def test_every_baseline_plays_the_evaluations_starts_and_a_repeated_command_redo
     checkpoints = list(folder.glob("baselines/*/*.safetensors"))
     times = [path.stat().st_mtime_ns for path in checkpoints]
     (folder / "evaluation" / "lift-bc.csv").unlink()  # as a kill would leave it
-    run(baselines, folder)
-    assert contents(folder, *kept) == written
-    assert [path.stat().st_mtime_ns for path in checkpoints] == times
-    assert len(played) == 2 * len(ALGORITHMS) + 1
+    with make_run(folder) as run:
+        baselines(run, BaselineSettings())
+        assert contents(folder, *kept) == written
+        assert [path.stat().st_mtime_ns for path in checkpoints] == times
+        assert len(played) == 2 * len(BASELINES) + 1
+        # The baselines are held to their own settings, the run is not.
+        with pytest.raises(BMRLError, match="updates is 8 here and 12 in the folder's run"):
+            baselines(run, BaselineSettings(updates=8))
 
-    # The baselines are held to their own settings, the run stays free of them.
-    with pytest.raises(SystemExit):
-        run(baselines, folder, "baselines.updates=8")
-    assert "updates is 8 here and 12 in the folder's run" in capsys.readouterr().err
+
+def test_without_demonstrations_the_error_names_the_recipe_that_writes_them(tmp_path: Path) -> None:
+    with make_run(tmp_path) as run:
+        with pytest.raises(BMRLError, match=r"statistics.json: no such file; recipes/collect.py"):
+            baselines(run, BaselineSettings())
+        assert not (tmp_path / "baselines").exists()
 
 
-def test_without_demonstrations_the_recipe_says_who_writes_them(
-    baselines: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        run(baselines, tmp_path)
-    assert "statistics.json: no such file; recipes/collect.py writes it" in capsys.readouterr().err
-    assert not (tmp_path / "baselines").exists()
+def test_a_task_without_an_environment_is_refused_before_training(tmp_path: Path) -> None:
+    tasks = {"door": {"demonstrations": "door.hdf5"}}
+    with (
+        Run(Settings(run_dir=str(tmp_path), tasks=tasks)) as run,
+        pytest.raises(BMRLError, match="door of tasks have no environment"),
+    ):
+        baselines(run, BaselineSettings())
+
+
+def test_the_table_shows_returns_alone_for_a_task_without_success() -> None:
+    rows = [
+        ResultRow(task=task, policy="bc", seed=0, episode=0, episode_return=2.0, success=success)
+        for task, success in (("b", True), ("a", None))
+    ]
+    table = make_table(rows, 5, {"a": "Ant", "b": "Ball"})
+    assert table.header[1:3] == ("Ant", "Ball")
+    assert table.rows == [("BC", "2.0", "2.0, 100%", "–", "–", "2")]
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        (
+            {"algorithms": ["ddpg"]},
+            "unknown baselines.algorithms 'ddpg'; .*iql, cql, bcq_one_hot",
+        ),
+        ({"algorithms": ["bc", "bc"]}, r"baselines.algorithms is .*; valid: .*each once"),
+        ({"updates": 0}, "baselines.updates is 0; valid: above 0"),
+    ],
+)
+def test_settings_that_are_not_valid_are_refused(values: dict[str, Any], says: str) -> None:
+    with pytest.raises(BMRLError, match=says):
+        check_settings(BaselineSettings(**values), "baselines.")

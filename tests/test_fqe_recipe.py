@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -17,26 +18,48 @@ pytest.importorskip("safetensors")
 pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
-from omegaconf import OmegaConf
-from small_runs import Run, configured, contents
+from small_runs import TASKS, Interruption, contents
 
-from torchrl_bmrl.errors import ConfigError
+from torchrl_bmrl.errors import BMRLError, StoppedError
+from torchrl_bmrl.pipeline import (
+    BCQSettings,
+    CollectSettings,
+    EvaluateSettings,
+    Run,
+    Settings,
+    collect,
+    stage1,
+)
+from torchrl_bmrl.run.settings import check_settings
+from torchrl_bmrl.studies.fqe import FQESettings, fqe, make_table, train_job
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
-SERIES = ["fqe.checkpoints=[3,6,12]", "fqe.updates=8", "fqe.num_candidates=3"]
 UPDATES = [3, 6, 12]
+SERIES = FQESettings(checkpoints=UPDATES, updates=8, num_candidates=3)
+
+
+def make_run(folder: Path) -> Run:
+    return Run(
+        Settings(
+            run_dir=str(folder),
+            workers=1,
+            tasks=TASKS,
+            collect=CollectSettings(train_episodes={"default": 1}, valid_episodes=1),
+            bcq=BCQSettings(epochs=2, updates_per_epoch=6, batch_size=8, num_cells=[16, 16]),
+            evaluate=EvaluateSettings(episodes=2, num_candidates=5),
+        )
+    )
 
 
 @pytest.fixture(scope="module")
-def studied(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def studied(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder with demonstrations, stage 1 and the study."""
-    import collect
-    import fqe
-    import train_bcq
-
+    pytest.importorskip("robosuite", exc_type=ImportError)
     folder = tmp_path_factory.mktemp("studied")
-    for stage in (collect.collect, train_bcq.train_all, fqe.fqe):
-        run(folder, stage, *SERIES, "evaluate.episodes=2")
+    with make_run(folder) as run:
+        collect(run)
+        stage1(run)
+        assert "| Reach |" in fqe(run, SERIES)
     return folder
 
 
@@ -72,47 +95,49 @@ def test_the_series_is_stage_1s_own_agent_on_its_way(studied: Path) -> None:
 
 @pytest.mark.robosuite
 @pytest.mark.slow
-def test_what_is_there_is_read_back_and_what_is_missing_made_again_the_same(
-    run: Run, studied: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    import fqe
-
+def test_what_is_there_is_read_back_and_what_is_missing_made_again_the_same(studied: Path) -> None:
     before = contents(studied, "fqe/**/*.csv", "fqe.csv", "tables/fqe.*")
     files = list((studied / "fqe").glob("*/*"))
     written = {path: path.stat().st_mtime_ns for path in files}
     (studied / "fqe" / "lift" / "6.csv").unlink()
-    run(studied, fqe.fqe, *SERIES, "evaluate.episodes=2")
-    assert contents(studied, "fqe/**/*.csv", "fqe.csv", "tables/fqe.*") == before
-    again = [path.name for path in files if path.stat().st_mtime_ns != written[path]]
-    assert again == ["6.csv"]
-    with pytest.raises(SystemExit):
-        run(studied, fqe.fqe, *SERIES[:2], "evaluate.episodes=2")
-    assert "num_candidates is 10 here and 3 in the folder's run" in capsys.readouterr().err
+    with make_run(studied) as run:
+        fqe(run, SERIES)
+        assert contents(studied, "fqe/**/*.csv", "fqe.csv", "tables/fqe.*") == before
+        again = [path.name for path in files if path.stat().st_mtime_ns != written[path]]
+        assert again == ["6.csv"]
+        with pytest.raises(BMRLError, match="num_candidates is 10 here and 3 in the folder's run"):
+            fqe(run, FQESettings(checkpoints=UPDATES, updates=8))
 
 
 @pytest.mark.robosuite
-def test_without_demonstrations_it_says_what_writes_them(
-    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    import fqe
+@pytest.mark.slow
+def test_a_stopped_series_saves_no_agent_between_its_numbers(studied: Path, tmp_path: Path) -> None:
+    shutil.copytree(studied / "data", tmp_path / "data")
+    job = (make_run(tmp_path), ("lift", UPDATES))
+    with pytest.raises(StoppedError):
+        train_job(job, Interruption(4, StoppedError))
+    assert [path.name for path in (tmp_path / "fqe" / "lift").iterdir()] == ["3.safetensors"]
+    train_job(job, lambda _: None)
+    series = "fqe/lift/*.safetensors"
+    assert contents(tmp_path, series) == contents(studied, series)
 
-    with pytest.raises(SystemExit):
-        run(tmp_path, fqe.fqe)
-    assert "recipes/collect.py writes it" in capsys.readouterr().err
-    assert not (tmp_path / "fqe").exists()
+
+@pytest.mark.robosuite
+def test_without_demonstrations_the_error_names_the_recipe_that_writes_them(tmp_path: Path) -> None:
+    with make_run(tmp_path) as run:
+        with pytest.raises(BMRLError, match=r"recipes/collect.py writes it"):
+            fqe(run, SERIES)
+        assert not (tmp_path / "fqe").exists()
 
 
-def test_the_table_tells_the_agent_that_would_be_chosen(recipes: Any) -> None:
-    pytest.importorskip("robosuite", exc_type=ImportError)
-    import fqe
-
+def test_the_table_tells_the_agent_that_would_be_chosen() -> None:
     numbers = {"reach": ([1, 3, 2], [10, 45, 20]), "lift": ([3, 1, 2], [10, 45, 20])}
     rows = [
         {"task": task, "updates": updates, "estimate": estimate, "return": value, "success": 0.0}
         for task, parts in numbers.items()
         for updates, estimate, value in zip((5, 10, 20), *parts, strict=True)
     ]
-    table = fqe.make_table(rows, ["reach", "lift"])
+    table = make_table(rows, {"reach": "Reach", "lift": "Lift"})
     found = [(line[0], line[1].split()[0], *line[2:]) for line in table.rows]
     assert found == [
         ("Reach", "1.00", "25.0", "45.0", "20.0", "45.0", "10"),
@@ -121,20 +146,26 @@ def test_the_table_tells_the_agent_that_would_be_chosen(recipes: Any) -> None:
     ]
 
 
+@pytest.mark.parametrize("series", [[5], [9, 5]])
+def test_a_series_is_at_least_two_numbers_from_low_to_high(
+    tmp_path: Path, series: list[int]
+) -> None:
+    with (
+        make_run(tmp_path) as run,
+        pytest.raises(BMRLError, match=r"fqe.checkpoints is .*; valid: at least two, from low"),
+    ):
+        fqe(run, FQESettings(checkpoints=series))
+
+
 @pytest.mark.parametrize(
-    ("override", "says"),
+    ("values", "says"),
     [
-        ("fqe.checkpoints=[5]", r"fqe.checkpoints is \[5\]; valid: at least two"),
-        ("fqe.checkpoints=[5,5]", "valid: at least two, from low to high"),
-        ("fqe.checkpoints=[9,5]", "valid: at least two, from low to high"),
-        ("fqe.checkpoints=[0,5]", r"fqe.checkpoints is \[0, 5\]; valid: above 0"),
-        ("fqe.updates=0", "fqe.updates is 0; valid: above 0"),
-        ("fqe.tau=2", "fqe.tau is 2.0; valid: between 0 and 1"),
+        ({"checkpoints": [5, 5]}, r"fqe.checkpoints is \[5, 5\]; valid: .*each once"),
+        ({"checkpoints": [0, 5]}, "fqe.checkpoints is 0; valid: above 0"),
+        ({"updates": 0}, "fqe.updates is 0; valid: above 0"),
+        ({"tau": 2.0}, "fqe.tau is 2.0; valid: above 0 and at most 1"),
     ],
 )
-def test_settings_that_make_no_series_are_refused(
-    recipes: Any, tmp_path: Path, override: str, says: str
-) -> None:
-    config = OmegaConf.to_object(configured("preset=smoke", f"run_dir={tmp_path}", override))
-    with pytest.raises(ConfigError, match=says):
-        recipes.check_settings(config)
+def test_settings_that_are_not_valid_are_refused(values: dict[str, Any], says: str) -> None:
+    with pytest.raises(BMRLError, match=says):
+        check_settings(FQESettings(**values), "fqe.")

@@ -1,4 +1,4 @@
-"""Recipes that study a finished run: human data, imitation, interpolation, learning on top."""
+"""Recipes that study a finished run: imitation, interpolation, learning on top."""
 
 from __future__ import annotations
 
@@ -26,101 +26,6 @@ from small_runs import (
     contents,
     times,
 )
-
-# -- human demonstrations --------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("overrides", "says"),
-    [
-        ([], "error: human.path is empty; valid: a robosuite demo.hdf5"),
-        (["human.path=nowhere.hdf5"], "error: nowhere.hdf5: no such file"),
-        (["human.path=a", "human.shares=[0.1]"], "error: human.shares is [0.1]; valid: 0 and"),
-        (["human.path=a", "human.shares=[0,1.5]"], "error: human.shares is [0.0, 1.5]; valid"),
-        (["human.path=a", "human.tracking=0"], "error: human.tracking is 0.0; valid: above 0"),
-    ],
-)
-def test_learning_from_people_names_what_is_missing(
-    run: Run, tmp_path: Path, overrides: list[str], says: str, capsys: Any
-) -> None:
-    import learn_from_people
-
-    with pytest.raises(SystemExit, match="1"):
-        run(tmp_path, learn_from_people.learn_from_people, *overrides)
-    said = capsys.readouterr().err
-    assert says in said
-    assert "Traceback" not in said
-
-
-def test_the_verdict_on_people_s_data_follows_from_the_interval(recipes: Any) -> None:
-    pytest.importorskip("robosuite", exc_type=ImportError)
-    import learn_from_people
-
-    def rows(share: float, gain: float, noise: float) -> list[dict[str, Any]]:
-        return [
-            {
-                "share": share,
-                "training_seed": i % 2,
-                "return": 100 + i + gain + noise * (-1) ** (i // 2),
-                "success": i % 2,
-            }
-            for i in range(20)
-        ]
-
-    table = learn_from_people.comparison(
-        rows(0, 0, 0) + rows(0.1, 5, 1) + rows(0.2, -5, 1) + rows(0.3, 0.1, 5), [0, 0.1, 0.2, 0.3]
-    ).splitlines()
-    assert table[2] == "| 0% | 109.5 | 10 of 20 | | |"
-    assert [line.split("|")[-2].strip() for line in table[3:6]] == [
-        "helped",
-        "hurt",
-        "no difference to be seen",
-    ]
-    assert "+5.0 (" in table[3]
-    few = learn_from_people.comparison(rows(0, 0, 0)[:4] + rows(0.1, 5, 1)[:4], [0, 0.1])
-    assert "too few episodes" in few
-
-
-@pytest.mark.robosuite
-@pytest.mark.slow
-def test_learning_from_people_compares_every_share_and_goes_on(
-    run: Run,
-    finished: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    import learn_from_people
-
-    # Any file in robomimic's layout with the task's observation may stand for people's.
-    options = [
-        f"human.path={finished / 'data' / 'lift.hdf5'}",
-        "human.shares=[0,1]",
-        "human.training_seeds=1",
-        "evaluate.episodes=2",
-    ]
-    run(tmp_path, learn_from_people.learn_from_people, *options)
-    table = (tmp_path / "tables" / "human.md").read_text()
-    assert [line.split("|")[1].strip() for line in table.splitlines()[2:4]] == ["0%", "100%"]
-    assert "0 of 2" in table
-    assert "too few episodes" in table
-    assert table in capsys.readouterr().out
-    with (tmp_path / "human.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [row["share"] for row in rows] == ["0.0", "0.0", "1.0", "1.0"]
-    before = times(tmp_path)
-    run(tmp_path, learn_from_people.learn_from_people, *options)
-    assert times(tmp_path) == before
-
-    # What the agents trained on: ten scripted transitions, then the human ones.
-    buffers: list[Any] = []
-    monkeypatch.setattr(learn_from_people, "train_agents", lambda *given: buffers.append(given[2]))
-    config = OmegaConf.to_object(configured(*SMALL, f"run_dir={tmp_path}"))
-    for share in (0.0, 1.0):
-        learn_from_people.train_job((config, share, 0), lambda _: None)
-    scripted, human = (buffer.sample()["index"] for buffer in buffers)
-    assert scripted.max() < HORIZON <= human.min()
-
 
 # -- one-shot imitation ----------------------------------------------------------------------------
 

@@ -115,6 +115,18 @@ class Run:
         """Whether every task has an environment."""
         return all(task.make_env is not None for task in self.tasks)
 
+    def check_playable(self) -> None:
+        """Checks that every task has an environment.
+
+        Raises:
+            ConfigError: naming the tasks without one.
+        """
+        without = [task.name for task in self.tasks if task.make_env is None]
+        if without:
+            raise ConfigError(
+                f"{', '.join(without)} of tasks have no environment; valid: tasks that have one"
+            )
+
     def task(self, name: str) -> Task:
         """The task of a name.
 

@@ -1,0 +1,1 @@
+"""Studies on a run: each is a function of the open run and its own settings."""
