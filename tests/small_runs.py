@@ -29,7 +29,7 @@ def tasks(*names: str) -> str:
 SMALL = [
     "preset=smoke",
     tasks("reach", "lift"),
-    "collect.train_episodes={default:1}",
+    "collect.train_episodes={default:1,lift:1}",
     "bcq.epochs=2",
     "bcq.updates_per_epoch=6",
     "bcq.batch_size=8",
@@ -55,9 +55,14 @@ def configured(*overrides: str) -> DictConfig:
 
 def make_run(folder: Path, *overrides: str) -> pipeline.Run:
     """The run that the small settings describe, not open."""
-    values = OmegaConf.to_object(configured(*SMALL, f"run_dir={folder}", *overrides))
+    return pipeline.Run(settings_of(*SMALL, f"run_dir={folder}", *overrides))
+
+
+def settings_of(*overrides: str) -> pipeline.Settings:
+    """Settings of a run that a command line gives, without those of studies."""
+    values = OmegaConf.to_object(configured(*overrides))
     names = [field.name for field in fields(pipeline.Settings)]
-    return pipeline.Run(pipeline.Settings(**{name: getattr(values, name) for name in names}))
+    return pipeline.Settings(**{name: getattr(values, name) for name in names})
 
 
 def recipe(name: str, *overrides: str, cwd: Path, **env: str) -> subprocess.CompletedProcess[str]:

@@ -51,7 +51,8 @@ from torchrl_bmrl.data.n_step import NStep
 from torchrl_bmrl.data.replay import make_mixed_replay_buffer, make_replay_buffer, with_previous
 from torchrl_bmrl.data.robomimic import write_episodes
 from torchrl_bmrl.data.sampler import read_memmap
-from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
+from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
+from torchrl_bmrl.tasks import get_task
 
 TOTAL = sum(LENGTHS)
 SPAWN = multiprocessing.get_context("spawn")
@@ -913,7 +914,9 @@ def test_a_killed_process_leaves_nothing_under_the_final_name(path: Path, tmp_pa
     assert entries(root) == sorted([remains, replay.data_path.name])
 
 
-# -- demonstrations of the six tasks ---------------------------------------------------------------
+# -- demonstrations of a run -----------------------------------------------------------------------
+
+REACH, LIFT = (get_task(name) for name in ("reach", "lift"))
 
 
 @pytest.fixture
@@ -926,31 +929,37 @@ def runs(tmp_path: Path) -> Path:
 
 def test_demonstrations_know_their_task(runs: Path) -> None:
     path = demonstration_path(runs, "lift")
-    data = read_demonstrations(path, num_task=1)
+    data = read_demonstrations(path, LIFT, index=1)
     assert isinstance(data, TensorDict)
     assert data["task"].tolist() == [1] * 24
     assert set(data.keys()) == {*TASK_PARTS, "action", "episode", "step", "next", "task"}
-    assert len(read_demonstrations(path, split="valid", num_task=1)) == 7
-    with pytest.raises(UnknownNameError):
-        demonstration_path(runs, "lft")
+    assert len(read_demonstrations(path, LIFT, split="valid", index=1)) == 7
 
 
 def test_parts_that_the_tasks_do_not_have_are_left_out(tmp_path: Path) -> None:
     write_file(tmp_path / "lift.hdf5", parts={**TASK_PARTS, **PARTS})
-    data = read_demonstrations(tmp_path / "lift.hdf5", num_task=1)
+    data = read_demonstrations(tmp_path / "lift.hdf5", LIFT, index=1)
     assert not set(PARTS) & set(data.keys())
 
 
 @pytest.mark.parametrize("name", TASK_PARTS)
-def test_another_robot_s_shapes_are_refused(tmp_path: Path, name: str) -> None:
-    (size,), dtype = TASK_PARTS[name]
+def test_a_part_that_is_missing_is_named(tmp_path: Path, name: str) -> None:
     path = tmp_path / "lift.hdf5"
-    write_file(path, parts={**TASK_PARTS, name: ((size + 1,), dtype)})
-    with pytest.raises(DataError, match=rf"lift\.hdf5: .*{name}: .*valid: .*{size}\)"):
-        read_demonstrations(path, num_task=1)
     write_file(path, parts={part: kind for part, kind in TASK_PARTS.items() if part != name})
     with pytest.raises(DataError, match=rf"lift\.hdf5: data/demo_0/obs/{name}: missing"):
-        read_demonstrations(path, num_task=1)
+        read_demonstrations(path, LIFT, index=1)
+
+
+@pytest.mark.parametrize("name", TASK_PARTS)
+def test_tasks_whose_parts_have_other_sizes_are_refused_together(runs: Path, name: str) -> None:
+    (size,), dtype = TASK_PARTS[name]
+    path = runs / "lift.hdf5"
+    write_file(path, train=2, parts={**TASK_PARTS, name: ((size + 1,), dtype)})
+    with pytest.raises(
+        DataError, match=rf"lift\.hdf5: .*{name} \({size + 1},\).*valid: .*of reach"
+    ):
+        write_statistics(runs, [REACH, LIFT])
+    assert not (runs / "statistics.json").exists()
 
 
 def rewrite(path: Path, **changes: Any) -> None:
@@ -958,22 +967,22 @@ def rewrite(path: Path, **changes: Any) -> None:
     write_episodes(path, [episode, episode], env_args={}, masks={"train": [0]})
 
 
-def test_actions_of_another_size_are_refused(tmp_path: Path) -> None:
-    rewrite(tmp_path / "lift.hdf5", actions=np.zeros((5, 6)))
-    with pytest.raises(DataError, match=r"lift\.hdf5: .*action.*: shape .*valid: .*7\)"):
-        read_demonstrations(tmp_path / "lift.hdf5", num_task=1)
+def test_tasks_whose_actions_have_other_sizes_are_refused_together(runs: Path) -> None:
+    rewrite(runs / "lift.hdf5", actions=np.zeros((5, 6)))
+    with pytest.raises(DataError, match=r"lift\.hdf5: .*action \(6,\); valid: .*action \(7,\)"):
+        write_statistics(runs, [REACH, LIFT])
 
 
 def test_demonstrations_without_successes_are_refused(tmp_path: Path) -> None:
     rewrite(tmp_path / "lift.hdf5", extras={})
     with pytest.raises(DataError, match=r"lift\.hdf5: .*no successes; valid: successes \(T,\)"):
-        read_demonstrations(tmp_path / "lift.hdf5", num_task=1)
+        read_demonstrations(tmp_path / "lift.hdf5", LIFT, index=1)
 
 
 def test_demonstrations_that_terminate_are_refused(tmp_path: Path) -> None:
     rewrite(tmp_path / "lift.hdf5", terminated=np.arange(5) == 4)
     with pytest.raises(DataError, match=r"lift\.hdf5: .*terminate"):
-        read_demonstrations(tmp_path / "lift.hdf5", num_task=1)
+        read_demonstrations(tmp_path / "lift.hdf5", LIFT, index=1)
 
 
 def observations(lengths: Sequence[int], count: int) -> np.ndarray:
@@ -989,17 +998,17 @@ def observations(lengths: Sequence[int], count: int) -> np.ndarray:
 
 
 def test_statistics_are_kept_for_each_task_and_over_all(runs: Path) -> None:
-    statistics = write_statistics(runs, ["reach", "lift"])
+    statistics = write_statistics(runs, [REACH, LIFT])
     reach, lift = observations([5, 6], 2), observations([9, 8], 2)  # what is trained on
     # Each task has the same weight, however many steps it has.
     loc = (reach.mean(0) + lift.mean(0)) / 2
     second = (((reach - loc) ** 2).mean(0) + ((lift - loc) ** 2).mean(0)) / 2
-    expected = {
-        None: (loc, np.sqrt(second)),
-        "reach": (reach.mean(0), reach.std(0)),
-        "lift": (lift.mean(0), lift.std(0)),
-    }
-    for task, (mean, scale) in expected.items():
+    expected = [
+        (None, loc, np.sqrt(second)),
+        (REACH, reach.mean(0), reach.std(0)),
+        (LIFT, lift.mean(0), lift.std(0)),
+    ]
+    for task, mean, scale in expected:
         read = read_statistics(runs, task)
         np.testing.assert_allclose(read.loc.numpy(), mean, rtol=1e-5, atol=1e-5)
         np.testing.assert_allclose(read.scale.numpy(), scale, rtol=1e-5, atol=1e-5)
@@ -1021,14 +1030,14 @@ def test_damaged_statistics_are_named(tmp_path: Path, content: str | None) -> No
 
 
 def test_statistics_of_a_task_that_has_none_are_refused(runs: Path) -> None:
-    write_statistics(runs, ["reach"])
+    write_statistics(runs, [REACH])
     with pytest.raises(DataError, match=r"statistics\.json: lift: "):
-        read_statistics(runs, "lift")
+        read_statistics(runs, LIFT)
 
 
 def test_transitions_are_normalised(runs: Path) -> None:
-    statistics = write_statistics(runs, ["reach", "lift"])
-    data = load_transitions(runs, "lift", statistics, split="valid", num_task=1)
+    statistics = write_statistics(runs, [REACH, LIFT])
+    data = load_transitions(runs, LIFT, statistics, split="valid", index=1)
     episode = make_episode(2, 7, parts=TASK_PARTS)
     assert data["observation"].shape == data["next", "observation"].shape == (7, 33)
     goal = (episode.next_observations["goal_pos"] - statistics.loc[-3:].numpy()) / (
@@ -1037,5 +1046,5 @@ def test_transitions_are_normalised(runs: Path) -> None:
     np.testing.assert_allclose(data["next", "observation"][:, -3:].numpy(), goal, rtol=1e-4)
     assert torch.equal(data["observation"][1:], data["next", "observation"][:-1])
     # Normalising does not change what is stored.
-    raw = read_demonstrations(demonstration_path(runs, "lift"), split="valid", num_task=1)
+    raw = read_demonstrations(demonstration_path(runs, "lift"), LIFT, split="valid", index=1)
     np.testing.assert_array_equal(raw["goal_pos"].numpy(), episode.observations["goal_pos"])

@@ -32,14 +32,14 @@ from torchrl_bmrl.errors import ConfigError, StoppedError
 SMALL = [
     "preset=smoke",
     "tasks=[reach,lift,push_up]",
-    "collect.train_episodes={default:1}",
+    "collect.train_episodes={default:1,lift:1}",
     "bcq.epochs=1",
     "bcq.updates_per_epoch=6",
     "bcq.batch_size=8",
     "bcq.num_cells=[16,16]",
     "evaluate.num_candidates=5",
 ]
-REACH = ["preset=smoke", "tasks=[reach]", "collect.train_episodes={default:1}", "workers=1"]
+REACH = ["preset=smoke", "tasks=[reach]", "collect.train_episodes={default:1,lift:1}", "workers=1"]
 
 
 @pytest.fixture(scope="module")

@@ -47,8 +47,9 @@ def show_results(folder: Path) -> dict[str, bytes]:
 def test_two_stages_from_an_empty_folder_to_the_report_and_again(tmp_path: Path) -> None:
     pytest.importorskip("robosuite", exc_type=ImportError)
     pytest.importorskip("matplotlib")
-    overrides = [*SMALL, "bcq.epochs=1", "evaluate.latent_sources=[online]"]
-    overrides += ["run_dir=run", "workers=1"]
+    overrides = [each for each in SMALL if not each.startswith("tasks=")]
+    overrides += ["tasks=[reach,lift]"]  # of their own length, in which demonstrations succeed
+    overrides += ["bcq.epochs=1", "evaluate.latent_sources=[online]", "run_dir=run", "workers=1"]
     done = recipe("two_stage", *overrides, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "report: run/report.html" in done.stdout
@@ -196,7 +197,7 @@ def test_an_exported_policy_acts_alone_as_it_does_in_its_run(
     assert not (alone / "data").exists()
     assert str(policy) in (alone / "report.html").read_text()
     card = (exported / "policy.md").read_text()
-    assert "1 of reach, 1 of lift" in card
+    assert "reach 1, lift 1; 1 held out of each" in card
     assert "| Lift | Distilled | online |" in card
 
 
@@ -204,7 +205,7 @@ def test_an_exported_policy_acts_alone_as_it_does_in_its_run(
 @pytest.mark.slow
 def test_an_exported_policy_has_a_file_that_acts_without_this_library(exported: Path) -> None:
     check_onnx(exported / "policy.onnx", exported / "policy.safetensors")
-    card = (exported / "policy.md").read_text()
+    card = " ".join((exported / "policy.md").read_text().split())
     assert "`action_latent (B, N, 14)`" in card
     assert "drawn from N(0, I) and clipped to ±0.5." in card
 
