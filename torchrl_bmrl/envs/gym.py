@@ -8,10 +8,11 @@ from importlib import import_module
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymEnv, SerialEnv, TransformedEnv
-from torchrl.envs.gym_like import default_info_dict_reader
-from torchrl.envs.transforms import ActionScaling, RenameTransform
+from torchrl.envs.gym_like import BaseInfoDictReader
+from torchrl.envs.transforms import ActionScaling
 
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.extras import needs
@@ -105,10 +106,22 @@ def _make_one(env: str, env_options: dict[str, Any], success: str | None) -> Env
     one = GymEnv(env, **env_options)
     if success is None:
         return one
-    spec = Composite({success: Unbounded((), dtype=torch.bool)})
-    one.set_info_dict_reader(default_info_dict_reader([success], spec=spec))
-    return (
-        one
-        if success == "success"
-        else TransformedEnv(one, RenameTransform([success], ["success"]))
-    )
+    return one.set_info_dict_reader(_SuccessReader(success))
+
+
+class _SuccessReader(BaseInfoDictReader):
+    """Writes a value of ``info`` as ``success ()``; TorchRL's own reader refuses Python's bools."""
+
+    def __init__(self, key: str) -> None:
+        self.key = key
+
+    def __call__(self, info: Mapping[str, Any], tensordict: TensorDictBase) -> TensorDictBase:
+        # Some environments give the value at the last step alone.
+        return tensordict.set("success", torch.tensor(bool(info.get(self.key, False))))
+
+    def reset(self) -> None:
+        """The key is the same for every episode."""
+
+    @property
+    def info_spec(self) -> Composite:
+        return Composite({"success": Unbounded((), dtype=torch.bool)})
