@@ -83,7 +83,7 @@ def test_actions_between_minus_one_and_one_span_the_environments_bounds(
     assert space.high.unique().tolist() == [1.0]
     start = env.reset().set("action", torch.full((*batch, 2), action, dtype=torch.float64))
     seen = env.step(start)["next", "observation"][..., :2]
-    expected = torch.as_tensor(LOW + share * (HIGH - LOW)).expand(*batch, 2)
+    expected = torch.as_tensor(LOW + share * (HIGH - LOW)).float().expand(*batch, 2)
     torch.testing.assert_close(seen, expected)
     env.close()
 

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymEnv, SerialEnv, TransformedEnv
 from torchrl.envs.gym_like import BaseInfoDictReader
-from torchrl.envs.transforms import ActionScaling
+from torchrl.envs.transforms import ActionScaling, DoubleToFloat
 
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.extras import needs
@@ -57,7 +57,7 @@ def make_gym_env(
         raise ConfigError(
             f"env is {env}, whose actions are {made.action_spec}; valid: numbers between bounds"
         )
-    return TransformedEnv(made, ActionScaling())
+    return TransformedEnv(made, ActionScaling(), auto_unwrap=True)
 
 
 def action_bounds(
@@ -104,9 +104,13 @@ def max_episode_steps(env: str, env_options: Mapping[str, Any] | None = None) ->
 
 def _make_one(env: str, env_options: dict[str, Any], success: str | None) -> EnvBase:
     one = GymEnv(env, **env_options)
-    if success is None:
-        return one
-    return one.set_info_dict_reader(_SuccessReader(success))
+    if success is not None:
+        one.set_info_dict_reader(_SuccessReader(success))
+    leaves = one.observation_spec.items(True, True)
+    double = [key for key, spec in leaves if spec.dtype == torch.float64]
+    # Not around several environments: TorchRL writes what they emit into what the transforms made
+    # of the step before, once one of them has ended.
+    return TransformedEnv(one, DoubleToFloat(in_keys=double)) if double else one
 
 
 class _SuccessReader(BaseInfoDictReader):
