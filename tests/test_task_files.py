@@ -94,6 +94,7 @@ def test_names_alone_are_registered_tasks() -> None:
         (["lift", "lift"], "each once"),
         ("lift", "tasks is 'lift'; valid: a list of names, or a YAML file of tasks"),
         (None, "tasks is None; valid: a list of names"),
+        ([1.1], r"tasks is \[1.1\]; valid: a list of names"),
         (["lfit"], "unknown task 'lfit'"),
         ({"a": {"task": "lfit"}}, "unknown task 'lfit'"),
         ({"a": {"task": "lift", "colour": 1}}, "option of task lift 'colour'"),

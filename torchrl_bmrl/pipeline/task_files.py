@@ -91,7 +91,7 @@ def make_tasks(tasks: Sequence[str] | Mapping[str, Mapping[str, Any]]) -> tuple[
     """
     if isinstance(tasks, Mapping):
         made = [_make_task(name, entry) for name, entry in tasks.items()]
-    elif isinstance(tasks, Sequence) and not isinstance(tasks, str):
+    elif isinstance(tasks, Sequence) and all(map(_is_text, tasks)) and not isinstance(tasks, str):
         made = [get_task(name) for name in tasks]
     else:
         raise ConfigError(f"tasks is {tasks!r}; valid: a list of names, or a YAML file of tasks")
