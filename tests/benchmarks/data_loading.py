@@ -34,9 +34,11 @@ from torchrl_bmrl.data.demonstrations import (
 )
 from torchrl_bmrl.data.robomimic import write_episodes
 from torchrl_bmrl.data.schema import OBSERVATION_SHAPES
-from torchrl_bmrl.names import HORIZON, TASKS
+from torchrl_bmrl.pipeline.settings import SIX_TASKS
+from torchrl_bmrl.tasks import get_task
 
-PAPER = {"reach": 500, "lift": 500} | {task: 100 for task in TASKS[2:]}
+PAPER = {"reach": 500, "lift": 500} | {task: 100 for task in SIX_TASKS[2:]}
+HORIZON = 200
 
 
 def random_episode(rng: np.random.Generator) -> Episode:
@@ -86,13 +88,14 @@ def load(folder: Path, batch_size: int) -> tuple[dict[str, float], int, float, f
     torch.set_num_threads(1)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     seconds: dict[str, float] = {}
+    tasks = [get_task(name) for name in PAPER]
     with timed("statistics, converting what is new", seconds):
-        write_statistics(folder, PAPER)
+        write_statistics(folder, tasks)
     statistics = read_statistics(folder)
     with timed("transitions, normalised", seconds):
         data = [
-            load_transitions(folder, task, statistics, split="train", num_task=i)
-            for i, task in enumerate(PAPER)
+            load_transitions(folder, task, statistics, split="train", index=i)
+            for i, task in enumerate(tasks)
         ]
     with timed("multi-task buffer", seconds):
         buffer = make_multi_task_replay_buffer(data, batch_size=batch_size)

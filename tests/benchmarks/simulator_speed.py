@@ -35,8 +35,9 @@ from torchrl_bmrl.evaluation.rollout import evaluate_policy
 from torchrl_bmrl.experts.collect import collect_demonstrations
 from torchrl_bmrl.experts.controllers import make_expert
 from torchrl_bmrl.modules import BCQPolicy
-from torchrl_bmrl.names import HORIZON, STEPPERS, TASKS
 from torchrl_bmrl.pipeline.agents import make_bcq_loss
+from torchrl_bmrl.pipeline.settings import SIX_TASKS, STEPPERS
+from torchrl_bmrl.tasks import get_task
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
@@ -82,11 +83,11 @@ def bare(env: TabletopEnv, states: list[np.ndarray]) -> float:
     return total
 
 
-def step_table(rounds: int, steps: int = HORIZON) -> None:
+def step_table(rounds: int, steps: int = 200) -> None:
     """Control steps per second of one process, per task."""
     print("\n| Task | robosuite | fast | bare, robosuite's model | bare, lean | fast / robosuite |"
           " fast / bare (robosuite's, lean) |\n|---|---:|---:|---:|---:|---:|---:|")  # fmt: skip
-    for task in TASKS:
+    for task in SIX_TASKS:
         stock, fast = (TabletopEnv(task, stepper=name) for name in reversed(STEPPERS))
         actions, states = episode(fast, steps)
         play(stock, actions[:3])  # compiled, and in the caches
@@ -108,10 +109,12 @@ def worker_table(episodes: int) -> None:
     for stepper in STEPPERS:
         for workers in (1, 2):
             with tempfile.TemporaryDirectory() as folder:
-                options = {"noise": 0.2, "seed": 0, "workers": workers, "stepper": stepper}
+                task = get_task("lift").with_options(stepper=stepper)
+                options = {"noise": 0.2, "seed": 0, "workers": workers}
                 time = seconds(
                     lambda: collect_demonstrations(
                         Path(folder),
+                        [task],  # noqa: B023
                         {"lift": episodes - 1},
                         valid_episodes=1,
                         **options,  # noqa: B023
@@ -123,7 +126,7 @@ def worker_table(episodes: int) -> None:
 
 def policy_table(steps: int = 50) -> None:
     """Time of a step of one episode, a policy of 100 candidates included."""
-    policy = BCQPolicy.frozen(make_bcq_loss())
+    policy = BCQPolicy.frozen(make_bcq_loss(observation_dim=33, action_dim=7))
     print("\n| Stepper | episodes side by side | ms per step of an episode |\n|---|---:|---:|")
     for stepper in STEPPERS:
         for number in (None, 1, 4, 20):
@@ -155,11 +158,11 @@ import sys
 from pathlib import Path
 def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4 / 1024
-from torchrl_bmrl.experts import collect
-from torchrl_bmrl.experts.controllers import ExpertGains
+from torchrl_bmrl.experts.collect import get_task
 before = resident()
-for task in ("lift", "push_left"):
-    collect.collect_episode(task, 0, noise=0.2, gains=ExpertGains(), stepper=sys.argv[1])
+for name in ("lift", "push_left"):
+    task = get_task(name).with_options(stepper=sys.argv[1])
+    task.record(0, noise=0.2, **task.options)
 print(f"{before:.0f} | {resident():.0f}")
 """
 
