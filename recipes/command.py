@@ -129,10 +129,10 @@ def with_folders_settings(config: DictConfig) -> DictConfig:
     taken = deepcopy(config)
     taken.run_dir = str(run_dir)  # it may refer to a setting that is taken
     tasks = theirs.pop("tasks", None)
-    if tasks is not None and "tasks" not in given:
+    # References in a file are not followed.
+    if tasks is not None and "tasks" not in given and "${" not in str(tasks):
         taken.tasks = tasks
     for key, value in flat(theirs):
-        # References in a file are not followed.
         if not _is_any(key, [*given, *OF_THE_COMMAND]) and "${" not in str(value):
             # Settings that no longer exist are skipped; invalid values are refused later.
             with suppress(OmegaConfBaseException):

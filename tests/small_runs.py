@@ -7,19 +7,29 @@ import runpy
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_bmrl import pipeline
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 HORIZON = 10
-TASKS = {name: {"task": name, "horizon": HORIZON} for name in ("reach", "lift")}
+
+
+def tasks(*names: str) -> str:
+    """The override for tasks with short episodes."""
+    entries = (f"{name}:{{task:{name},horizon:{HORIZON}}}" for name in names)
+    return f"tasks={{{','.join(entries)}}}"
+
+
 SMALL = [
     "preset=smoke",
-    f"tasks={{reach:{{task:reach,horizon:{HORIZON}}},lift:{{task:lift,horizon:{HORIZON}}}}}",
-    "collect.train_episodes={default:1}",
+    tasks("reach", "lift"),
+    "collect.train_episodes={default:1,lift:1}",
     "bcq.epochs=2",
     "bcq.updates_per_epoch=6",
     "bcq.batch_size=8",
@@ -37,8 +47,22 @@ Run = Callable[..., Path]
 
 
 def configured(*overrides: str) -> DictConfig:
+    """The settings as a command composes them; of two overrides of one key the last one counts."""
+    overrides = tuple({each.partition("=")[0]: each for each in overrides}.values())
     with initialize_config_dir(version_base="1.3", config_dir=str(RECIPES / "config")):
         return compose("recipe", overrides=list(overrides))
+
+
+def make_run(folder: Path, *overrides: str) -> pipeline.Run:
+    """The run that the small settings describe, not open."""
+    return pipeline.Run(settings_of(*SMALL, f"run_dir={folder}", *overrides))
+
+
+def settings_of(*overrides: str) -> pipeline.Settings:
+    """Settings of a run that a command line gives, without those of studies."""
+    values = OmegaConf.to_object(configured(*overrides))
+    names = [field.name for field in fields(pipeline.Settings)]
+    return pipeline.Settings(**{name: getattr(values, name) for name in names})
 
 
 def recipe(name: str, *overrides: str, cwd: Path, **env: str) -> subprocess.CompletedProcess[str]:

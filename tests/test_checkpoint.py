@@ -240,7 +240,7 @@ def test_without_a_checkpoint_there_is_nothing_to_go_on_from(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("damaged", [1, 2])
 def test_a_damaged_newest_is_said_and_set_aside_and_the_one_before_is_the_newest(
-    path: Path, damaged: int, capsys: pytest.CaptureFixture[str]
+    path: Path, damaged: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     keep_four(path, 3)
     for file in [path, earlier(path, 1)][:damaged]:
@@ -250,7 +250,7 @@ def test_a_damaged_newest_is_said_and_set_aside_and_the_one_before_is_the_newest
     found = load_newest(path, kind="example")
     assert found is not None
     assert found[0] == {"step": 3 - damaged}
-    said = capsys.readouterr().err
+    said = caplog.text
     assert f"{path}: not a whole checkpoint" in said
     assert f"going on from checkpoint.{damaged}.safetensors" in said
     assert path.with_name("checkpoint.damaged.safetensors").exists()
@@ -485,6 +485,7 @@ def test_settings_of_no_networks_are_refused_before_any_are_made(
     [
         ("tasks", ["reach", "lift"]),
         ("tasks", ["reach", "lift", "../../etc/passwd"]),
+        ("tasks", ["reach", "lift", "lift"]),
         ("tasks", "abc"),
         ("tasks", [["reach"], "lift", "push_up"]),
         ("latent_clip", -1),

@@ -17,17 +17,11 @@ pytest.importorskip("safetensors")
 pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
-from omegaconf import OmegaConf
-from small_runs import (
-    RECIPES,
-    SMALL,
-    command_line,
-    configured,
-    recipe,
-)
+from small_runs import RECIPES, command_line, configured, make_run, recipe, settings_of
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.evaluation import write_results
+from torchrl_bmrl.pipeline import Run, Settings
 
 
 @pytest.mark.parametrize(
@@ -70,6 +64,12 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
     assert list(tmp_path.iterdir()) == []
 
 
+def check(settings: Settings) -> Run:
+    """What a command checks before it opens the folder."""
+    settings.check()
+    return Run(settings)
+
+
 @pytest.mark.parametrize(
     ("override", "says"),
     [
@@ -79,7 +79,9 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
         ("only=[lift,lift]", "only is .'lift', 'lift'.; valid: .*each once"),
         ("only=[lfit]", "only is .'lfit'.; valid: some of .'reach', 'lift'"),
         ("+collect.train_episodes.lfit=1", "unknown task 'lfit'"),
-        ("collect.train_episodes.lift=0", "collect.train_episodes"),
+        ("+collect.after.lfit=[reach]", "unknown task 'lfit'"),
+        ("+collect.after.lift=['',reach-lfit]", "unknown task 'lfit'"),
+        ("collect.train_episodes.lift=0", "collect.train_episodes.lift is 0; valid: above 0"),
         ("collect.valid_episodes=0", "collect.valid_episodes"),
         ("evaluate.latent_sources=[]", r"evaluate.latent_sources is \[\]"),
         ("evaluate.latent_sources=[mean]", "'mean'; .*prototype, online, demonstration"),
@@ -89,40 +91,30 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
         ("distill.prototype=mode", "distill.prototype 'mode'; .*mean, medoid"),
         ("bcq.loss_function=l3", "bcq.loss_function 'l3'; .*l2, l1, smooth_l1"),
         ("bcq.kl_reduction=max", "bcq.kl_reduction 'max'; .*mean, sum"),
-        ("bcq.lmbda=1.5", "bcq.lmbda is 1.5; valid: between 0 and 1"),
-        ("bcq.generator_warmup=-1", "bcq.generator_warmup is -1; valid: 0 or above"),
-        ("bcq.critic_grad_clip=0", "bcq.critic_grad_clip is 0.0; valid: above 0, or null"),
+        ("bcq.lmbda=1.5", "bcq.lmbda is 1.5; valid: at least 0 and at most 1"),
+        ("bcq.generator_warmup=-1", "bcq.generator_warmup is -1; valid: at least 0"),
+        ("bcq.critic_grad_clip=0", "bcq.critic_grad_clip is 0.0; valid: above 0"),
         ("bcq.value_bounds=[1,0]", r"value_bounds are .1.0, 0.0.; valid: .*low < high"),
-        ("distill.encoder_terms=[critic]", "unknown encoder term 'critic'; .*qvalue, metric"),
-        ("distill.metric_weight=-1", "distill.metric_weight is -1.0; valid: 0 or above"),
-        ("distill.isometry_weight=-1", "distill.isometry_weight is -1.0; valid: 0 or above"),
+        ("distill.encoder_terms=[critic]", "distill.encoder_terms 'critic'; .*qvalue, metric"),
+        ("distill.metric_weight=-1", "distill.metric_weight is -1.0; valid: at least 0"),
+        ("distill.isometry_weight=-1", "distill.isometry_weight is -1.0; valid: at least 0"),
         ("workers=0", "workers is 0"),
         ("bcq.lr=0", "bcq.lr is 0"),
         ("bcq.seeds=0", "bcq.seeds is 0"),
-        (("only=[lift]", "bcq.stacked=true"), "only is .*; valid: null with bcq.stacked"),
-        ("bcq.target_dtype=float8", "bcq.target_dtype 'float8'; .*None, bfloat16"),
+        (("only=[lift]", "bcq.stacked=true"), "only is .*; valid with bcq.stacked: null"),
         ("device=gpu", "device is 'gpu'; valid: one that torch can use"),
         ("bcq.eval_episodes=0", "bcq.eval_episodes is 0"),
         ("evaluate.episodes=-1", "evaluate.episodes is -1"),
-        ("interpolation.episodes=0", "interpolation.episodes is 0"),
-        ("interpolation.task=lfit", "unknown task 'lfit'"),
         ("checkpoint_interval=0", "checkpoint_interval is 0"),
-        ("latent_sac.composition=reach-lfit", "unknown task 'lfit'"),
-        ("latent_sac.hold=0", "latent_sac.hold is 0"),
-        ("latent_sac.seeds=[1,1]", r"latent_sac.seeds is \[1, 1\]; valid: at least one, each once"),
-        ("latent_sac.random_steps=-1", "latent_sac.random_steps is -1; valid: 0 or above"),
-        ("baselines.algorithms=[ddpg]", "unknown baseline 'ddpg'; .*td3_bc, iql, cql, bcq_one_hot"),
-        ("baselines.algorithms=[bc,bc]", r"baselines.algorithms is .*; valid: .*each once"),
-        ("baselines.updates=0", "baselines.updates is 0; valid: above 0, or null"),
     ],
 )
 def test_every_stage_is_checked_before_the_first_one_starts(
     recipes: Any, tmp_path: Path, override: str | tuple[str, ...], says: str
 ) -> None:
     overrides = [override] if isinstance(override, str) else override
-    config = OmegaConf.to_object(configured("preset=smoke", f"run_dir={tmp_path}", *overrides))
+    settings = settings_of("preset=smoke", f"run_dir={tmp_path}", *overrides)
     with pytest.raises(BMRLError, match=says):
-        recipes.check_settings(config)
+        check(settings)
 
 
 @pytest.mark.parametrize(
@@ -159,44 +151,45 @@ def test_what_was_imported_is_not_searched_whenever_an_environment_closes(
     gc.unfreeze()
     recipes.run_recipe(
         configured("preset=smoke", f"run_dir={tmp_path}"),
-        lambda config: left_alone.append(gc.get_freeze_count()),
+        lambda run: left_alone.append(gc.get_freeze_count()),
     )
     assert left_alone[0] > 100_000
 
 
-def test_an_episode_has_the_length_of_now_whenever_a_recipe_was_imported(
-    recipes: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_rows_that_are_read_back_are_reported_as_the_steps_that_they_took(
+    recipes: Any, tmp_path: Path
 ) -> None:
-    pytest.importorskip("robosuite", exc_type=ImportError)
     pytest.importorskip("matplotlib")
-    import evaluate
-    import interpolate
+    from torchrl_bmrl.pipeline.evaluate import keep_rows
 
-    from torchrl_bmrl import names
-
-    config = OmegaConf.to_object(configured(*SMALL, f"run_dir={tmp_path}"))
+    run = make_run(tmp_path, "tasks={lift:{task:lift,horizon:7}}", "evaluate.episodes=3")
     (tmp_path / "evaluation").mkdir()
     write_results(tmp_path / "evaluation" / "lift-bcq.csv", [])
-    monkeypatch.setattr(names, "HORIZON", 7)
-    assert interpolate.job_size((config, "prototype")) == 7 * config.interpolation.episodes
     reported: list[int] = []
-    evaluate.keep_rows(config, "lift", "bcq", lambda _: [], report=reported.append)
-    assert reported == [7 * config.evaluate.episodes]
+    keep_rows(run, "lift", "bcq", lambda _: [], report=reported.append)
+    assert reported == [7 * 3]
 
 
 @pytest.mark.parametrize("preset", ["smoke", "quick", "paper", "literal", "compose"])
 def test_every_preset_is_complete_and_valid(recipes: Any, tmp_path: Path, preset: str) -> None:
-    config = OmegaConf.to_object(configured(f"preset={preset}", f"run_dir={tmp_path}"))
-    recipes.check_settings(config)
-    assert config.tasks == ["reach", "lift", "push_right", "push_left", "push_up", "push_down"]
+    settings = settings_of(f"preset={preset}", f"run_dir={tmp_path}")
+    settings.check()
+    assert list(Run(settings).names) == [
+        "reach",
+        "lift",
+        "push_right",
+        "push_left",
+        "push_up",
+        "push_down",
+    ]
 
 
 def test_the_presets_differ_in_what_their_names_say(recipes: Any, tmp_path: Path) -> None:
     paper, literal, quick = (
-        OmegaConf.to_object(configured(f"preset={preset}", f"run_dir={tmp_path}"))
+        settings_of(f"preset={preset}", f"run_dir={tmp_path}")
         for preset in ("paper", "literal", "quick")
     )
-    assert list(paper.collect.train_episodes.values()) == [500, 500, 100, 100, 100, 100]
+    assert list(Run(paper).settings.collect.train_episodes.values()) == [500, 500, *[100] * 4]
     assert literal.distill.context_fraction == literal.distill.latent_norm_weight == 0.0
     assert literal.distill.encoder_terms == ["classification"]
     assert literal.bcq == quick.bcq
@@ -212,12 +205,10 @@ def test_an_ablation_is_valid_and_changes_one_group_of_settings_of_any_preset(
     recipes: Any, tmp_path: Path, preset: str, ablation: str
 ) -> None:
     plain, config = (
-        OmegaConf.to_object(
-            configured(f"preset={preset}", f"ablation={name}", f"run_dir={tmp_path}")
-        )
+        settings_of(f"preset={preset}", f"ablation={name}", f"run_dir={tmp_path}")
         for name in ("none", ablation)
     )
-    recipes.check_settings(config)
+    check(config)
     assert (config.preset, config.ablation) == (preset, ablation)
     groups = [group for group, value in vars(plain).items() if value != getattr(config, group)]
     if ablation == "none":
@@ -232,7 +223,7 @@ def test_an_ablation_is_valid_and_changes_one_group_of_settings_of_any_preset(
 
 def test_what_each_ablation_takes_away_is_away(recipes: Any, tmp_path: Path) -> None:
     def ablated(name: str) -> Any:
-        return OmegaConf.to_object(configured(f"ablation={name}", f"run_dir={tmp_path}"))
+        return settings_of(f"ablation={name}", f"run_dir={tmp_path}")
 
     assert ablated("no_direction").distill.direction_weight == 0
     assert ablated("no_isometry").distill.isometry_weight == 0
@@ -245,6 +236,6 @@ def test_what_each_ablation_takes_away_is_away(recipes: Any, tmp_path: Path) -> 
     assert [ablated(f"acting_{n}").evaluate.num_candidates for n in (1, 10)] == [1, 10]
     assert [ablated(f"noise_{n}").collect.noise for n in (0, 40)] == [0.0, 0.4]
     for n in (10, 50, 100):
-        assert set(ablated(f"demos_{n}").collect.train_episodes.values()) == {n}
-    paper = OmegaConf.to_object(configured("preset=paper", f"run_dir={tmp_path}"))
+        assert set(Run(ablated(f"demos_{n}")).settings.collect.train_episodes.values()) == {n}
+    paper = settings_of("preset=paper", f"run_dir={tmp_path}")
     assert ablated("demos_all").collect == paper.collect

@@ -8,6 +8,7 @@ import re
 import shlex
 import sys
 import types
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -99,7 +100,9 @@ def test_every_command_is_of_a_kind_that_a_test_or_the_checks_of_a_change_run() 
     for page, line in COMMANDS:
         words = parts(line)
         is_python = words[0] == "python" and (
-            (words[1] == "-m" and words[2] == "torchrl_bmrl.data") or (ROOT / words[1]).is_file()
+            (words[1] == "-m" and words[2] == "torchrl_bmrl.data")
+            or (ROOT / words[1]).is_file()
+            or f"<!-- file: {words[1]} -->" in page.read_text()  # test_own_tasks.py runs it
         )
         assert words[0] in known or is_python, f"{page.name}: {line}"
 
@@ -132,19 +135,20 @@ def test_every_command_of_a_recipe_gives_settings_that_it_takes(
 ) -> None:
     """What the recipes then do, test_recipes.py and its like execute at small sizes."""
     recipe = Path(words[1]).stem
-    alone = {"extrapolation": "mujoco"}  # has settings of its own
     for package in ("hydra", "gymnasium", "h5py", "safetensors", "scipy", "tqdm"):
         pytest.importorskip(package)
-    if recipe in alone:
-        pytest.importorskip(alone[recipe])
     from hydra import compose, initialize_config_dir
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from omegaconf import OmegaConf
 
+    from torchrl_bmrl.pipeline import Run
+    from torchrl_bmrl.run.settings import check_settings
+
     monkeypatch.syspath_prepend(str(ROOT / "recipes"))
-    name = recipe if recipe in alone else "recipe"
-    # What has the settings and checks them; most recipes themselves import the simulator.
-    module = importlib.import_module("settings" if name == "recipe" else name)
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    import command
+
+    importlib.import_module(recipe)  # adds the settings of its study
     # test_command_line.py reads the help, test_multirun.py runs the launchers.
     options = [word for word in words[2:] if not word.startswith(("--help", "hydra/", "hydra."))]
     if "--multirun" in options:
@@ -159,13 +163,16 @@ def test_every_command_of_a_recipe_gives_settings_that_it_takes(
         ]
     with initialize_config_dir(version_base="1.3", config_dir=str(ROOT / "recipes" / "config")):
         # Set first: what it is otherwise is Hydra's to say, in a command.
-        config = compose(name, overrides=["run_dir=runs/mine", *options])
-    config = OmegaConf.to_object(config)
-    if recipe == "extrapolation":
-        module.check_settings(config)
-    elif name == "recipe":
-        monkeypatch.setattr("settings.check_device", lambda device: None)  # there may be no GPU
-        module.check_settings(config)
+        config = compose("recipe", overrides=["run_dir=runs/mine", *options])
+    values = OmegaConf.to_object(config)
+    settings = command.Settings(
+        **{each.name: getattr(values, each.name) for each in fields(command.Settings)}
+    )
+    settings.check(device=False)  # there may be no GPU
+    for name in command._sections:
+        check_settings(getattr(values, name), f"{name}.")
+    if not isinstance(settings.tasks, str):  # a page's own file of tasks
+        Run(settings)
 
 
 @pytest.mark.robosuite

@@ -74,7 +74,7 @@ def test_a_package_that_is_there_and_fails_says_why() -> None:
 
 def test_a_mistake_of_this_library_and_an_extra_named_below_are_left_as_they_are() -> None:
     with pytest.raises(ImportError, match="no_such_name") as caught, needs("data"):
-        from torchrl_bmrl.names import no_such_name  # noqa: F401
+        from torchrl_bmrl.errors import no_such_name  # noqa: F401
     assert not isinstance(caught.value, MissingExtraError)
     below = r"torchrl_bmrl\[recipes\]"
     with pytest.raises(MissingExtraError, match=below), needs("data"), needs("recipes"):

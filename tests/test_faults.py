@@ -20,9 +20,9 @@ pytest.importorskip("safetensors")
 pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
-from small_runs import Run, contents, times
+from small_runs import Run, contents, tasks, times
 
-from torchrl_bmrl.run import workers as parallel
+from torchrl_bmrl.run import workers
 from torchrl_bmrl.run.locks import hold
 from torchrl_bmrl.run.progress import Lines
 from torchrl_bmrl.training.checkpoint import load_checkpoint
@@ -64,7 +64,7 @@ def signal_after(patch: pytest.MonkeyPatch, units: int) -> None:
         if sum(done) >= units > sum(done[:-1]):
             signal.raise_signal(signal.SIGTERM)
 
-    patch.setattr(parallel, "progress", type("Bar", (Lines,), {"update": update}))
+    patch.setattr(workers, "progress", type("Bar", (Lines,), {"update": update}))
 
 
 @pytest.mark.parametrize(
@@ -88,15 +88,10 @@ def test_asked_to_stop_a_stage_keeps_what_it_did_and_goes_on_to_the_same_result(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    import distill
-    import evaluate
-    import train_bcq
-    import two_stage
-
-    from torchrl_bmrl.experts import collect as experts
+    from torchrl_bmrl.pipeline import two_stage
 
     with monkeypatch.context() as patch:
-        run_jobs = parallel.run_jobs
+        run_jobs = workers.run_jobs
         at = {"collect": 0, "train_bcq": 1, "distill": 2, "evaluate": 3}[stage]
         calls = []
 
@@ -106,9 +101,9 @@ def test_asked_to_stop_a_stage_keeps_what_it_did_and_goes_on_to_the_same_result(
                 signal_after(patch, units)
             return run_jobs(*arguments, **options)
 
-        for module in (experts, train_bcq, distill, evaluate):
-            patch.setattr(module, "run_jobs", counting)
-        assert ends(run, tmp_path / "run", two_stage.two_stage) == 143
+        for module in ("torchrl_bmrl.experts.collect", "torchrl_bmrl.pipeline.run"):
+            patch.setattr(f"{module}.run_jobs", counting)
+        assert ends(run, tmp_path / "run", two_stage) == 143
     said = capsys.readouterr().err
     assert "stopped by SIGTERM; what was done is kept, the same command goes on" in said
     assert "Traceback" not in said
@@ -120,7 +115,7 @@ def test_asked_to_stop_a_stage_keeps_what_it_did_and_goes_on_to_the_same_result(
         assert len(found) == kept
     else:
         assert 0 < len(found) < len(contents(finished, files))
-    run(tmp_path / "run", two_stage.two_stage)
+    run(tmp_path / "run", two_stage)
     # But for the checkpoint before the newest: there is one more of them.
     both = [contents(folder, *STAGES) for folder in (finished, tmp_path / "run")]
     differing = {name for name in both[0] if both[0][name] != both[1].get(name)}
@@ -135,28 +130,29 @@ def test_asked_to_stop_a_stage_keeps_what_it_did_and_goes_on_to_the_same_result(
 def test_a_second_run_in_a_folder_is_refused_by_the_owner_and_writes_nothing(
     run: Run, copied: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import two_stage
+    from torchrl_bmrl.pipeline import two_stage
 
     before = contents(copied, "**/*")
     with hold(copied):
-        assert ends(run, copied, two_stage.two_stage) == 1
+        assert ends(run, copied, two_stage) == 1
         assert f"error: {copied}: in use by process {os.getpid()} on " in capsys.readouterr().err
         after = contents(copied, "**/*")
     new = {name for name in after if name not in before}
     assert all(name.startswith(".locks") for name in new)
     assert {name: after[name] for name in before} == before
-    run(copied, two_stage.two_stage)
+    run(copied, two_stage)
 
 
 def test_jobs_of_other_tasks_share_a_folder_and_the_same_task_is_refused(
     run: Run, collected: Path, recipes: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import train_bcq
     from small_runs import SMALL, configured
+
+    from torchrl_bmrl.pipeline import stage1
 
     def train(task: str) -> None:
         settings = configured(*SMALL, f"run_dir={collected}", "workers=1", f"only=[{task}]")
-        recipes.run_recipe(settings, train_bcq.train_all, splits=True)
+        recipes.run_recipe(settings, stage1, splits=True)
 
     with hold(collected, ["lift"]):
         train("reach")
@@ -164,7 +160,7 @@ def test_jobs_of_other_tasks_share_a_folder_and_the_same_task_is_refused(
             train("lift")
         assert "in use by" in capsys.readouterr().err
         # The whole run would train it, too.
-        assert ends(run, collected, train_bcq.train_all) == 1
+        assert ends(run, collected, stage1) == 1
     assert not (collected / "bcq" / "lift").exists()
 
 
@@ -175,13 +171,13 @@ def test_jobs_of_other_tasks_share_a_folder_and_the_same_task_is_refused(
 def test_a_run_goes_on_from_the_checkpoint_before_a_damaged_one(
     run: Run, finished: Path, copied: Path, folder: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    import two_stage
+    from torchrl_bmrl.pipeline import two_stage
 
     path = f"{folder}/checkpoint.safetensors"
     data = bytearray((copied / path).read_bytes())
     data[len(data) // 2] ^= 4
     (copied / path).write_bytes(data)
-    run(copied, two_stage.two_stage)
+    run(copied, two_stage)
     said = capfd.readouterr().err
     assert f"{path}: not a whole checkpoint" in said
     assert "its checksum differs" in said
@@ -207,13 +203,12 @@ def test_a_run_goes_on_from_the_checkpoint_before_a_damaged_one(
 def test_a_damaged_file_of_a_run_is_named_in_one_line(
     run: Run, copied: Path, path: str, text: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import distill
-    import two_stage
+    from torchrl_bmrl.pipeline import stage2, two_stage
 
     (copied / path).write_text(text)
     shutil.rmtree(copied / "distill")  # something is left to do
     # What is cheap to make is made again: collecting would mend the statistics.
-    stage = distill.distill if path.startswith("data") else two_stage.two_stage
+    stage = stage2 if path.startswith("data") else two_stage
     assert ends(run, copied, stage) == 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert said.startswith("error: ")
@@ -228,11 +223,11 @@ def test_a_damaged_file_of_a_run_is_named_in_one_line(
 def test_a_folder_that_cannot_be_written_is_named_in_one_line(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import two_stage
+    from torchrl_bmrl.pipeline import two_stage
 
     (tmp_path / "file").touch()
     for folder, why in ((tmp_path / "file" / "run", "Not a directory"), (Path("/proc/run"), "")):
-        assert ends(run, folder, two_stage.two_stage) == 1
+        assert ends(run, folder, two_stage) == 1
         (said,) = capsys.readouterr().err.splitlines()
         assert said.startswith(f"error: {folder}")
         assert why in said
@@ -247,7 +242,7 @@ def test_a_full_disk_is_named_in_one_line_and_what_was_kept_stays(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    import two_stage
+    from torchrl_bmrl.pipeline import two_stage
 
     folder = tmp_path / "run"
     shutil.copytree(finished / "data", folder / "data")
@@ -263,13 +258,13 @@ def test_a_full_disk_is_named_in_one_line_and_what_was_kept_stays(
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
-        assert ends(run, folder, two_stage.two_stage) == 1
+        assert ends(run, folder, two_stage) == 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert f"/{place}/" in said
     assert "No space left on device; what was done is kept, the same command goes on" in said
     assert not list(folder.rglob("*.tmp"))
     before = times(folder)
-    run(folder, two_stage.two_stage)
+    run(folder, two_stage)
     unchanged = times(folder)
     assert all(unchanged[name] == before[name] for name in before if "/checkpoint" not in name)
     assert contents(folder, *STAGES) == contents(finished, *STAGES)
@@ -278,13 +273,13 @@ def test_a_full_disk_is_named_in_one_line_and_what_was_kept_stays(
 def test_a_gpu_without_memory_says_what_to_lower(
     run: Run, collected: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import train_bcq
+    from torchrl_bmrl.pipeline import learners, stage1
 
     def full(*arguments: Any) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nDetails.")
 
-    monkeypatch.setattr(train_bcq, "gradient_step", full)
-    assert ends(run, collected, train_bcq.train_all) == 1
+    monkeypatch.setattr(learners, "gradient_step", full)
+    assert ends(run, collected, stage1) == 1
     (said,) = capsys.readouterr().err.splitlines()
     assert said.startswith(
         "error: CUDA out of memory. Tried to allocate 2.00 GiB.; lower bcq.batch"
@@ -298,14 +293,15 @@ def test_a_run_whose_logger_fails_goes_on_and_says_so_once(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    import train_bcq
     from torchrl.record.loggers.csv import CSVLogger
+
+    from torchrl_bmrl.pipeline import stage1
 
     def unreachable(*arguments: Any, **options: Any) -> None:
         raise ConnectionError("server not reached")
 
     monkeypatch.setattr(CSVLogger, "log_scalar", unreachable)
-    run(collected, train_bcq.train_all, "tasks=[reach,lift]")
+    run(collected, stage1, tasks("reach", "lift"))
     said = capsys.readouterr().err
     assert said.count("metrics are logged no more, from step 4 on (server not reached)") == 2
     assert contents(collected, "bcq/*/*") == contents(finished, "bcq/*/*")
@@ -354,11 +350,11 @@ def test_what_goes_wrong_is_named_within_one_logging_interval_and_the_good_check
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    import train_bcq
+    from torchrl_bmrl.pipeline import learners, stage1
 
-    step, calls = train_bcq.gradient_step, []
+    step, calls = learners.gradient_step, []
     agents: list[Any] = []
-    make = train_bcq.Agents
+    make = learners.Agents
 
     class Watched(make):  # type: ignore[misc, valid-type]
         def __init__(self, *arguments: Any) -> None:
@@ -371,10 +367,10 @@ def test_what_goes_wrong_is_named_within_one_logging_interval_and_the_good_check
         if len(calls) == 2 * 5:  # after the fifth update, checkpoint and look are at the fourth
             broken(what, 5)(agents[-1])
 
-    monkeypatch.setattr(train_bcq, "Agents", Watched)
-    monkeypatch.setattr(train_bcq, "gradient_step", breaking)
-    overrides = ["bcq.stacked=true"] if stacked else ["tasks=[lift]"]
-    assert ends(run, collected, train_bcq.train_all, *overrides) == 1
+    monkeypatch.setattr(sys.modules[stage1.__module__], "Agents", Watched)
+    monkeypatch.setattr(learners, "gradient_step", breaking)
+    overrides = ["bcq.stacked=true"] if stacked else [tasks("lift")]
+    assert ends(run, collected, stage1, *overrides) == 1
     said = capsys.readouterr().err
     assert re.search(rf"error: bcq (reach|lift), update 8: {says}", said), said
     assert "checkpoint is kept" in said
@@ -401,11 +397,12 @@ def test_a_student_that_goes_wrong_is_named_within_one_logging_interval(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    import distill
+    from torchrl_bmrl.pipeline import stage2
 
+    module: Any = sys.modules[stage2.__module__]  # the package's function hides its name
     shutil.copytree(finished / "bcq", collected / "bcq")
-    step, calls, students = distill.gradient_step, [], []
-    make = distill.Student
+    step, calls, students = module.gradient_step, [], []
+    make = module.Student
 
     def watched(**options: Any) -> Any:
         students.append(make(**options))
@@ -425,9 +422,9 @@ def test_a_student_that_goes_wrong_is_named_within_one_logging_interval(
                 else:
                     layers[4].bias.fill_(50.0)
 
-    monkeypatch.setattr(distill, "Student", watched)
-    monkeypatch.setattr(distill, "gradient_step", breaking)
-    assert ends(run, collected, distill.distill) == 1
+    monkeypatch.setattr(module, "Student", watched)
+    monkeypatch.setattr(module, "gradient_step", breaking)
+    assert ends(run, collected, stage2) == 1
     said = capsys.readouterr().err
     assert re.search(rf"error: distillation, update 8: {says}", said), said
     path = collected / "distill" / "checkpoint.safetensors"
@@ -437,10 +434,10 @@ def test_a_student_that_goes_wrong_is_named_within_one_logging_interval(
 def test_looking_at_the_numbers_changes_none_of_them(
     run: Run, finished: Path, collected: Path
 ) -> None:
-    import train_bcq
+    from torchrl_bmrl.pipeline import stage1
 
     # Other intervals are other settings, but not other agents.
-    run(collected, train_bcq.train_all, "log_interval=1")
+    run(collected, stage1, "log_interval=1")
     for task in ("reach", "lift"):
         states = [
             load_checkpoint(folder / "bcq" / task / "checkpoint.safetensors", kind="bcq")[0]

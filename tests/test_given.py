@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,34 +19,32 @@ pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
 import yaml
-from small_runs import RECIPES, SMALL, command_line, configured, contents
+from small_runs import RECIPES, SMALL, command_line, configured, contents, settings_of
 
 from torchrl_bmrl.errors import ConfigError
+from torchrl_bmrl.pipeline import Run
 from torchrl_bmrl.run.folder import open_run, read_settings
 from torchrl_bmrl.run.locks import hold, hold_run
 
-MADE = ("preset=paper", "ablation=dim4", "seed=3", "bcq.lr=1e-4", "imitate.episodes=10")
-MADE += ("collect.after.lift=['',reach]", "workers=7", "verbose=true", "device=cuda")
+MADE = ("preset=paper", "ablation=dim4", "seed=3", "bcq.lr=1e-4")
+MADE += ("+collect.after.lift=['',reach]", "workers=7", "verbose=true", "device=cuda")
 
 
 @pytest.fixture
-def made(tmp_path: Path) -> Path:
-    """The folder of a run with settings of its own, nothing in it yet."""
-    from omegaconf import OmegaConf
-
+def made(recipes: Any, tmp_path: Path) -> Path:
+    """The folder of a run with settings of its own and of a study, nothing in it yet."""
     folder = tmp_path / "made"
-    overrides = [*MADE, f"run_dir={folder}", "+collect.after.lift=['',reach]"]
-    overrides.remove("collect.after.lift=['',reach]")
-    open_run(folder, OmegaConf.to_container(configured(*overrides), resolve=True))
+    run = Run(settings_of(*MADE, f"run_dir={folder}"))
+    open_run(folder, asdict(run.settings) | {"imitate": {"episodes": 10}})
     return folder
 
 
 def started(recipes: Any, name: str, *overrides: str) -> tuple[int, list[Any]]:
-    """A recipe's exit code and the settings that it would have run with."""
+    """A recipe's exit code and the settings that it would have run with, and its study's."""
     ran: list[Any] = []
 
-    def run(settings: Any, function: Any, **options: Any) -> None:
-        original(settings, ran.append, **options)
+    def run(config: Any, function: Any, **options: Any) -> None:
+        original(config, lambda run, *study: ran.extend([run.settings, *study]), **options)
 
     original = recipes.run_recipe
     with pytest.MonkeyPatch.context() as patch:
@@ -65,14 +64,15 @@ def test_a_command_on_a_run_takes_what_it_does_not_give_from_the_folder(
 ) -> None:
     pytest.importorskip("robosuite", exc_type=ImportError)
     before = contents(made, "*")
-    code, (config,) = started(recipes, name, f"run_dir={made}", "workers=2")
+    code, (config, *study) = started(recipes, name, f"run_dir={made}", "workers=2")
     assert code == 0
     assert (config.preset, config.ablation, config.seed) == ("paper", "dim4", 3)
     assert config.collect.train_episodes["lift"] == 500
     assert config.collect.after == {"lift": ["", "reach"]}
     assert config.bcq.lr == 1e-4
     assert config.evaluate.episodes == 50
-    assert config.imitate.episodes == 10  # a study's own are the folder's, too
+    if name == "imitate":
+        assert study[0].episodes == 10  # a study's own are the folder's, too
     # This machine's and this command's are not; nor does this one need what trained.
     assert (config.workers, config.verbose, config.run_dir) == (2, False, str(made))
     assert config.device == "cuda"
@@ -93,7 +93,7 @@ def test_a_command_on_a_run_takes_what_it_does_not_give_from_the_folder(
         (["evaluate.episodes=20"], "evaluate.episodes is 20 here and 50 in"),
         (["~collect.after"], "does not support deletion"),
         (["device=gpu"], "device is gpu here and cuda in"),
-        (["imitate.episodes=-5"], "imitate.episodes is -5; valid: above 0"),
+        (["evaluate.fqe_updates=-5"], "evaluate.fqe_updates is -5; valid: above 0"),
     ],
 )
 def test_what_a_command_gives_and_differs_is_refused(
@@ -117,8 +117,8 @@ def test_what_a_command_gives_and_differs_is_refused(
     [
         (["preset=paper"], {}),
         (["preset=paper", "ablation=dim4", "seed=3"], {}),
-        (["bcq.lr=1e-4", "imitate.episodes=20"], {"imitate.episodes": 20}),
-        (["latent_sac={hold:5}"], {"latent_sac.hold": 5, "latent_sac.num_candidates": 20}),
+        (["bcq.lr=1e-4", "checkpoint_interval=7"], {"checkpoint_interval": 7}),
+        (["evaluate={episodes:50}"], {"evaluate.episodes": 50, "evaluate.num_candidates": 100}),
         (["logger=none"], {"logger": "none"}),
     ],
 )
@@ -166,7 +166,6 @@ def test_a_folder_that_was_not_given_is_compared_and_not_taken_over(
         ("bcq", 3),
         ("tasks", "${oc.env:HOME}"),
         ("evaluate.policy", "${oc.env:HOME}"),
-        ("imitation", {"a": 1}),
         ("bcq.lrr", 1),
         ("collect.train_episodes", []),
     ],
@@ -185,28 +184,6 @@ def test_settings_of_a_folder_that_are_none_are_refused_by_their_name(
     assert said.startswith("error: ")
     assert f"{key}" in said
     assert os.environ["HOME"] not in said.replace(str(made), "")
-
-
-def test_the_extrapolation_experiment_knows_its_folder_too(
-    recipes: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("gymnasium.envs.mujoco")
-    import extrapolation
-
-    settings = extrapolation.Settings(run_dir=str(tmp_path / "run"), seeds=[4], updates=7)
-    open_run(tmp_path / "run", vars(settings))
-    ran: list[Any] = []
-
-    def stop(function: Any, jobs: list[Any], **options: Any) -> None:
-        ran.append(jobs[0][0])
-        raise ConfigError("that was all")
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("torchrl_bmrl.run.workers.run_jobs", stop)
-        assert command_line("extrapolation", f"run_dir={tmp_path / 'run'}", "workers=1") == 1
-    assert (ran[0].seeds, ran[0].updates, ran[0].workers) == ([4], 7, 1)
-    assert command_line("extrapolation", f"run_dir={tmp_path / 'run'}", "updates=8") == 1
-    assert "updates is 8 here and 7 in the folder's run" in capsys.readouterr().err
 
 
 @pytest.mark.robosuite
@@ -236,9 +213,9 @@ def test_a_run_lies_in_the_folder_that_was_typed(
     recipes: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    code, (config,) = started(recipes, "train_bcq", f"run_dir={name}", f"human.path={name}")
+    code, (config,) = started(recipes, "train_bcq", f"run_dir={name}", f"evaluate.policy={name}")
     typed = name.strip("'")
-    assert (code, config.run_dir, config.human.path) == (0, typed, typed)
+    assert (code, config.run_dir, config.evaluate.policy) == (0, typed, typed)
     assert [path.name for path in tmp_path.iterdir()] == [typed]
     assert read_settings(tmp_path / typed)["run_dir"] == typed
 
@@ -265,7 +242,7 @@ def test_what_is_no_folder_is_refused(
 @pytest.mark.parametrize(
     ("line", "typed"),
     [
-        ("tasks=[1.10, lift,'1.0']", "tasks=['1.10', lift,'1.0']"),
+        ("only=[1.10, lift,'1.0']", "only=['1.10', lift,'1.0']"),
         ("run_dir=1.10,a,2.0", "run_dir='1.10',a,'2.0'"),
         ("run_dir=choice(1.10,1.0)", "run_dir=choice('1.10','1.0')"),
         ("only=[1.0],[lift]", "only=['1.0'],[lift]"),
@@ -391,8 +368,6 @@ def test_small_runs_settings_are_the_commands_own_without_a_command_line(
     recipes: Any, tmp_path: Path
 ) -> None:
     """In code nothing is taken over: what is passed is what is compared."""
-    import given
-
     open_run(tmp_path, {"seed": 5})
     settings = configured(*SMALL, f"run_dir={tmp_path}")
-    assert given.with_folders_settings(settings) is settings
+    assert recipes.with_folders_settings(settings) is settings

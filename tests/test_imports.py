@@ -26,7 +26,16 @@ EXTRAS = (
     "wandb",
     "yaml",
 )
-CORE = ("objectives", "modules", "data", "data.replay", "functional", "errors", "names")
+CORE = (
+    "objectives",
+    "modules",
+    "data",
+    "data.replay",
+    "functional",
+    "errors",
+    "tasks",
+    "training.update",
+)
 
 # What TorchRL and its own dependencies import is theirs; the rest is made impossible to import.
 CODE = f"""
@@ -54,6 +63,6 @@ def test_the_core_imports_without_any_extra() -> None:
     tops = {name.partition(".")[0] for name in answer["new"]}
     assert "torchrl_bmrl" in tops
     assert not tops & set(EXTRAS)
-    heavy = {"agents", "checkpoint", "configs", "envs", "evaluation", "experts", "parallel"}
-    heavy |= {"reports", "runs"}
+    heavy = {"configs", "envs", "evaluation", "experts", "pipeline", "reports", "run.workers"}
+    heavy |= {"run.folder", "training.checkpoint"}
     assert not {f"torchrl_bmrl.{name}" for name in heavy} & set(answer["new"])

@@ -25,7 +25,7 @@ pytest.importorskip("safetensors")
 pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
-from small_runs import RECIPES, SMALL, contents, short_episodes
+from small_runs import RECIPES, SMALL, contents
 
 from torchrl_bmrl.data.robomimic import open_episodes, read_kept_episode
 from torchrl_bmrl.evaluation import read_results
@@ -77,14 +77,13 @@ def read_everything(folder: Path) -> dict[str, bytes]:
 
 
 def test_killed_at_any_moment_a_run_has_lost_nothing_and_ends_with_the_same_files(
-    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
     if KILLS:
         whole = tmp_path / "whole"
         seconds = finish(whole)
     else:  # one worker's; where two are done before the moment, it is drawn again
         whole, seconds = request.getfixturevalue("finished"), 20.0
-        monkeypatch.setenv("PYTHONPATH", short_episodes(tmp_path / "patch"))
     expected = contents(whole, *EQUAL)
     assert len(expected) > 40
     moments, killed = random.Random(0), 0

@@ -32,14 +32,14 @@ from torchrl_bmrl.errors import ConfigError, StoppedError
 SMALL = [
     "preset=smoke",
     "tasks=[reach,lift,push_up]",
-    *(f"collect.train_episodes.{task}=1" for task in ("reach", "lift", "push_up")),
+    "collect.train_episodes={default:1,lift:1}",
     "bcq.epochs=1",
     "bcq.updates_per_epoch=6",
     "bcq.batch_size=8",
     "bcq.num_cells=[16,16]",
     "evaluate.num_candidates=5",
 ]
-REACH = ["preset=smoke", "tasks=[reach]", "collect.train_episodes.reach=1", "workers=1"]
+REACH = ["preset=smoke", "tasks=[reach]", "collect.train_episodes={default:1,lift:1}", "workers=1"]
 
 
 @pytest.fixture(scope="module")
@@ -54,11 +54,11 @@ def beside() -> Iterator[None]:
 def run(beside: None) -> Callable[..., Path]:
     """Runs a recipe's function alone, in this process."""
     pytest.importorskip("robosuite", exc_type=ImportError)
-    import settings
+    import command
 
     def run(folder: Path, function: Any, *overrides: str, **options: Any) -> Path:
         config = configured(*overrides, f"run_dir={folder}", "workers=1")
-        settings.run_recipe(config, function, **options)
+        command.run_recipe(config, function, **options)
         return folder
 
     return run
@@ -122,7 +122,7 @@ def test_a_job_that_is_asked_to_stop_stops_the_sweep(
 
 RECIPE = f"""
 import os, signal, time
-import hydra, settings
+import hydra, command
 from torchrl_bmrl.run.command_line import exit_codes
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.run.logs import write_line
@@ -232,11 +232,11 @@ def test_a_batch_goes_on_after_one_whose_jobs_failed(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def alone(run: Any, tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, bytes]]:
     """The data of seeds 0 and 2, each collected by a run of its own."""
-    import collect
+    from torchrl_bmrl.pipeline import collect
 
     folders = [tmp_path_factory.mktemp("alone") for _ in range(2)]
     for folder, seed in zip(folders, (0, 2), strict=True):
-        run(folder, collect.collect, *REACH, f"seed={seed}")
+        run(folder, collect, *REACH, f"seed={seed}")
     return [contents(folder, "data/**/*") for folder in folders]
 
 
@@ -314,13 +314,12 @@ def test_jobs_on_a_cluster_are_single_runs(alone: Any, tmp_path: Path, cluster: 
 @pytest.mark.slow
 def test_agents_spread_over_jobs_are_those_of_one_run(run: Any, tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    import collect
-    import train_bcq
+    from torchrl_bmrl.pipeline import collect, stage1
 
-    one = run(tmp_path / "one", collect.collect, *SMALL)
+    one = run(tmp_path / "one", collect, *SMALL)
     spread = tmp_path / "spread"
     shutil.copytree(one / "data", spread / "data")
-    run(one, train_bcq.train_all, *SMALL)
+    run(one, stage1, *SMALL)
     # Two agents in a job: its workers are processes of a process.
     options = ["run_dir=spread", "workers=2", "only=[reach,lift],[push_up]", "logger=none"]
     launcher = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
@@ -335,9 +334,9 @@ def test_agents_spread_over_jobs_are_those_of_one_run(run: Any, tmp_path: Path) 
 def test_a_recipe_that_does_not_split_refuses_only_some_tasks(
     run: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import distill
+    from torchrl_bmrl.pipeline import stage2
 
     with pytest.raises(SystemExit):
-        run(tmp_path / "run", distill.distill, *SMALL, "only=[reach]")
+        run(tmp_path / "run", stage2, *SMALL, "only=[reach]")
     assert "error: only is ['reach']; valid: null, except with" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import re
 import subprocess
@@ -160,7 +161,7 @@ def test_a_log_that_nobody_takes_ends_no_run(monkeypatch: pytest.MonkeyPatch) ->
 
 def talk_and_work(name: str, report: Report) -> None:
     for number in range(100):
-        write_line(f"{name} {number:03} " + name * 60)
+        logging.getLogger("torchrl_bmrl.test").info(f"{name} {number:03} " + name * 60)
         time.sleep(0.01)
         report(1)
 
@@ -170,8 +171,10 @@ def talk_and_work(name: str, report: Report) -> None:
 def test_a_pipe_gets_whole_lines_from_all_workers(workers: int, tmp_path: Path) -> None:
     script = f"""
 from test_progress import OPTIONS, module, talk_and_work
+from torchrl_bmrl.run.logs import log_to_stderr
 from torchrl_bmrl.run.workers import run_jobs
 if __name__ == "__main__":
+    log_to_stderr()
     module.SOON, module.INTERVAL = 0.1, 0.02
     run_jobs(talk_and_work, list("abcd"), workers={workers}, **OPTIONS)
 """
@@ -201,12 +204,14 @@ if __name__ == "__main__":
 def test_every_stage_of_a_run_says_how_far_it_is_in_a_batch_systems_log(tmp_path: Path) -> None:
     pytest.importorskip("hydra")
     pytest.importorskip("robosuite", exc_type=ImportError)
-    from small_runs import SMALL, recipe, short_episodes
+    from small_runs import SMALL, recipe
 
-    path = short_episodes(tmp_path / "site")
-    with (tmp_path / "site" / "sitecustomize.py").open("a") as file:
-        file.write("import torchrl_bmrl.run.progress as module\n")
-        file.write("module.SOON, module.INTERVAL = 0.01, 0.02\n")
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(
+        "import torchrl_bmrl.run.progress as module\nmodule.SOON, module.INTERVAL = 0.01, 0.02\n"
+    )
+    search = [str(tmp_path / "site"), os.environ.get("PYTHONPATH", "")]
+    path = os.pathsep.join(filter(None, search))
     done = recipe("two_stage", *SMALL, "run_dir=run", "workers=2", cwd=tmp_path, PYTHONPATH=path)
     assert done.returncode == 0, done.stderr
     said = done.stderr.splitlines()

@@ -15,8 +15,7 @@ pytest.importorskip("safetensors")
 pytest.importorskip("tqdm")
 pytest.importorskip("wandb")
 
-from omegaconf import OmegaConf
-from small_runs import SMALL, Interruption, Run, configured
+from small_runs import Interruption, Run, make_run
 from wandb_files import offline, read_runs
 
 
@@ -26,26 +25,26 @@ from wandb_files import offline, read_runs
 def test_each_task_and_stage_logs_to_its_own_wandb_run_and_goes_on_in_it(
     run: Run, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stacked: bool
 ) -> None:
-    import distill
-    import train_bcq
+    from torchrl_bmrl.pipeline import stage1, stage2
+    from torchrl_bmrl.pipeline.stage1 import train_job
 
     offline(monkeypatch, tmp_path / "home")
     folder, csv = tmp_path / "run", tmp_path / "csv"
     options = ["logger=csv", f"bcq.stacked={str(stacked).lower()}"]
     for copy in (folder, csv):
         shutil.copytree(finished / "data", copy / "data")
-    for stage in (train_bcq.train_all, distill.distill):
+    for stage in (stage1, stage2):
         run(csv, stage, *options)
     options[0] = "logger=wandb"
-    config = OmegaConf.to_object(configured(*SMALL, *options, f"run_dir={folder}"))
+    made = make_run(folder, *options)
     agents = {"reach": "reach", "lift": "lift"}
     for job in [agents] if stacked else [{name: name} for name in agents]:
         with pytest.raises(KeyboardInterrupt):  # after a checkpoint at 4, a row at 4
-            train_bcq.train_job((config, job), Interruption(7 * len(job), KeyboardInterrupt))
+            train_job((made, job), Interruption(7 * len(job), KeyboardInterrupt))
     first = read_runs(folder)
     time.sleep(1.1)  # wandb's folders have the second of their start in their names
-    run(folder, train_bcq.train_all, *options)
-    run(folder, distill.distill, *options)
+    run(folder, stage1, *options)
+    run(folder, stage2, *options)
 
     found = read_runs(folder)
     assert [run["name"] for run in first] == ["bcq_reach", "bcq_lift"]

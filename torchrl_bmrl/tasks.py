@@ -97,8 +97,11 @@ class Task:
             raise ConfigError(f"a task's name is {self.name!r}; valid: letters, digits, _ and .")
         if (self.record is None) == (self.files is None):
             raise ConfigError(f"task {self.name} needs demonstrations; valid: record or files")
-        if self.horizon is not None and self.horizon < 1:
-            raise ConfigError(f"horizon of task {self.name} is {self.horizon}; valid: above 0")
+        horizon = self.horizon
+        if horizon is not None and (not isinstance(horizon, int) or horizon < 1):
+            raise ConfigError(
+                f"horizon of task {self.name} is {horizon}; valid: a whole number above 0"
+            )
         if not self.title:
             object.__setattr__(self, "title", self.name.replace("_", " ").capitalize())
 

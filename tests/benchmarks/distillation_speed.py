@@ -41,7 +41,7 @@ def make_update(
     torch.manual_seed(0)
     losses = [make_bcq_loss(observation_dim=OBSERVATION_DIM, action_dim=ACTION_DIM)] * TASKS
     teachers = [BCQPolicy.frozen(loss) for loss in losses]
-    student = Student(num_tasks=TASKS)
+    student = Student(num_tasks=TASKS, observation_dim=OBSERVATION_DIM, action_dim=ACTION_DIM)
     loss = make_distillation_loss(student, teachers, deactivate_vmap=in_sequence).to(device)
     ours = make_adam(loss.parameters(), lr=LR)
     theirs = torch.optim.Adam(loss.parameters(), lr=LR)

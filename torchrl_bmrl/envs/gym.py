@@ -8,10 +8,11 @@ from importlib import import_module
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymEnv, SerialEnv, TransformedEnv
-from torchrl.envs.gym_like import default_info_dict_reader
-from torchrl.envs.transforms import ActionScaling, RenameTransform
+from torchrl.envs.gym_like import BaseInfoDictReader
+from torchrl.envs.transforms import ActionScaling, DoubleToFloat
 
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.extras import needs
@@ -56,7 +57,7 @@ def make_gym_env(
         raise ConfigError(
             f"env is {env}, whose actions are {made.action_spec}; valid: numbers between bounds"
         )
-    return TransformedEnv(made, ActionScaling())
+    return TransformedEnv(made, ActionScaling(), auto_unwrap=True)
 
 
 def action_bounds(
@@ -103,12 +104,28 @@ def max_episode_steps(env: str, env_options: Mapping[str, Any] | None = None) ->
 
 def _make_one(env: str, env_options: dict[str, Any], success: str | None) -> EnvBase:
     one = GymEnv(env, **env_options)
-    if success is None:
-        return one
-    spec = Composite({success: Unbounded((), dtype=torch.bool)})
-    one.set_info_dict_reader(default_info_dict_reader([success], spec=spec))
-    return (
-        one
-        if success == "success"
-        else TransformedEnv(one, RenameTransform([success], ["success"]))
-    )
+    if success is not None:
+        one.set_info_dict_reader(_SuccessReader(success))
+    leaves = one.observation_spec.items(True, True)
+    double = [key for key, spec in leaves if spec.dtype == torch.float64]
+    # Not around several environments: TorchRL writes what they emit into what the transforms made
+    # of the step before, once one of them has ended.
+    return TransformedEnv(one, DoubleToFloat(in_keys=double)) if double else one
+
+
+class _SuccessReader(BaseInfoDictReader):
+    """Writes a value of ``info`` as ``success ()``; TorchRL's own reader refuses Python's bools."""
+
+    def __init__(self, key: str) -> None:
+        self.key = key
+
+    def __call__(self, info: Mapping[str, Any], tensordict: TensorDictBase) -> TensorDictBase:
+        # Some environments give the value at the last step alone.
+        return tensordict.set("success", torch.tensor(bool(info.get(self.key, False))))
+
+    def reset(self) -> None:
+        """The key is the same for every episode."""
+
+    @property
+    def info_spec(self) -> Composite:
+        return Composite({"success": Unbounded((), dtype=torch.bool)})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import reprlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -309,7 +310,7 @@ def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
     number = len(student.prototypes)
     valid: dict[str, tuple[Callable[[Any], bool], str]] = {
         "tasks": (
-            lambda x: isinstance(x, list) and len(x) == number and all(map(_is_name, x)),
+            lambda x: isinstance(x, list) and all(map(_is_task_name, x)) and len(set(x)) == number,
             f"{number} different names, one per prototype",
         ),
         "latent_clip": (lambda x: x is None or (_is_number(x) and x > 0), "a number above 0, null"),
@@ -329,6 +330,11 @@ def _is_number(x: Any) -> bool:
 
 def _is_name(x: Any) -> bool:
     return isinstance(x, str) and 0 < len(x) <= 200
+
+
+def _is_task_name(x: Any) -> bool:
+    """Whether a file may be named after a task of this name, also after several, ``"a-b"``."""
+    return _is_name(x) and re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", x) is not None
 
 
 def _are_statistics(x: Any) -> bool:

@@ -31,7 +31,7 @@ from torchrl_bmrl.pipeline.settings import SIX_TASKS, Settings
 from torchrl_bmrl.pipeline.task_files import make_tasks, read_task_file
 from torchrl_bmrl.run.locks import hold_run
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
-from torchrl_bmrl.tasks import Task, compose_tasks
+from torchrl_bmrl.tasks import Task, compose_tasks, get_task
 
 log = logging.getLogger(__name__)
 
@@ -65,12 +65,15 @@ class Run:
         False
     """
 
+    _opened: ExitStack | None = None  # the lock, which no copy of the run has
+
     def __init__(self, settings: Settings) -> None:
         tasks = list(SIX_TASKS) if settings.tasks is None else settings.tasks
         if isinstance(tasks, str):
             tasks = read_task_file(tasks)
         made = make_tasks(tasks)
         self.tasks = tuple(_with_run_options(task, settings, made) for task in made)
+        _check_names(settings, self.names)
         self.folder = Path(settings.run_dir)
         episodes = _train_episodes(settings, self.tasks)
         collect = replace(settings.collect, train_episodes=episodes)
@@ -79,20 +82,20 @@ class Run:
             unknown = [name for name in only if name not in self.names]
             if not only or unknown or len(set(only)) < len(only):
                 raise ConfigError(f"only is {only}; valid: some of {list(self.names)}, each once")
-        self._opened = ExitStack()
-        self._is_open = False
 
     def __enter__(self) -> Run:
         # Jobs that train only some tasks leave the other tasks and everything else to other jobs.
         parts = self.settings.only or ["run", *self.names]
-        self._opened.enter_context(hold_run(self.folder, asdict(self.settings), parts))
-        self._is_open = True
+        opened = ExitStack()
+        opened.enter_context(hold_run(self.folder, asdict(self.settings), parts))
+        self._opened = opened
         gc.freeze()  # imported modules stay; robosuite would search them at every env.close()
         return self
 
     def __exit__(self, *error: Any) -> bool | None:
-        self._is_open = False
-        return self._opened.__exit__(*error)
+        assert self._opened is not None
+        opened, self._opened = self._opened, None
+        return opened.__exit__(*error)
 
     def __getstate__(self) -> dict[str, Any]:
         kept = ("settings", "folder", "tasks")
@@ -217,7 +220,7 @@ class Run:
         Raises:
             BMRLError: if the run is not open.
         """
-        if not self._is_open:
+        if self._opened is None:
             raise BMRLError(f"{self.folder} is not open; valid: with Run(settings) as run: ...")
 
     def seed(self, *names: str | int) -> int:
@@ -305,6 +308,15 @@ def _with_run_options(task: Task, settings: Settings, tasks: Sequence[Task]) -> 
     chosen = {"stepper": settings.stepper, "robot": settings.robot}
     known = {key: x for key, x in chosen.items() if x is not None and key in task.options}
     return task.with_options(**known)
+
+
+def _check_names(settings: Settings, names: Sequence[str]) -> None:
+    """Refuses settings of tasks that do not exist; those of other registered tasks are ignored."""
+    episodes, after = settings.collect.train_episodes, settings.collect.after
+    parts = [part for entries in after.values() for entry in entries for part in entry.split("-")]
+    for name in [*episodes, *after, *filter(None, parts)]:
+        if name not in ("default", *names):
+            get_task(name)
 
 
 def _train_episodes(settings: Settings, tasks: Sequence[Task]) -> dict[str, int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,17 +13,27 @@ from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.run.folder import read_yaml
 from torchrl_bmrl.tasks import DemonstrationFiles, Task, get_task
 
-_OF_FILES = (
-    "demonstrations",
-    "read",
-    "valid_share",
-    "env",
-    "env_options",
-    "horizon",
-    "success",
-    "parts",
-    "title",
-)
+
+def _is_text(x: Any) -> bool:
+    return isinstance(x, str) and x != ""
+
+
+def _is_mapping(x: Any) -> bool:
+    return isinstance(x, Mapping)
+
+
+_OF_FILES: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "demonstrations": (_is_text, "a file or folder"),
+    "read": (_is_mapping, "options by name"),
+    "valid_share": (lambda x: isinstance(x, float | int) and 0 < x < 1, "a number between 0 and 1"),
+    "env": (_is_text, "gymnasium's id"),
+    "env_options": (_is_mapping, "options by name"),
+    "horizon": (lambda x: isinstance(x, int) and x > 0, "a whole number above 0"),
+    "success": (_is_text, "a key of info"),
+    "parts": (lambda x: isinstance(x, list | tuple) and all(map(_is_text, x)), "a list of names"),
+    "title": (_is_text, "a text"),
+}
+"""Keys of a description of files: what their values must be; all but the first may be null."""
 
 
 def read_task_file(path: str | Path) -> dict[str, dict[str, Any]]:
@@ -81,7 +91,7 @@ def make_tasks(tasks: Sequence[str] | Mapping[str, Mapping[str, Any]]) -> tuple[
     """
     if isinstance(tasks, Mapping):
         made = [_make_task(name, entry) for name, entry in tasks.items()]
-    elif isinstance(tasks, Sequence) and not isinstance(tasks, str):
+    elif isinstance(tasks, Sequence) and all(map(_is_text, tasks)) and not isinstance(tasks, str):
         made = [get_task(name) for name in tasks]
     else:
         raise ConfigError(f"tasks is {tasks!r}; valid: a list of names, or a YAML file of tasks")
@@ -107,16 +117,20 @@ def _make_task(name: str, entry: Mapping[str, Any]) -> Task:
             f"task {name} has {', '.join(entry) or 'nothing'}; valid: demonstrations (a file or "
             "folder) or task (the name of a registered one)"
         )
-    for key in entry:
+    for key, value in entry.items():
         if key not in _OF_FILES:
             raise ConfigError(f"task {name}: unknown key {key!r}; valid: {', '.join(_OF_FILES)}")
+        is_valid, valid = _OF_FILES[key]
+        missing = value is None and key != "demonstrations"
+        if not missing and (isinstance(value, bool) or not is_valid(value)):
+            raise ConfigError(f"task {name}: {key} is {value!r}; valid: {valid}")
     read = entry.get("read") or {}
     ReadOptions.from_mapping(read)  # refused here and not in the middle of a run
     parts, env, success = entry.get("parts"), entry.get("env"), entry.get("success")
     files = DemonstrationFiles(
         path=str(entry["demonstrations"]),
         read=read,
-        valid_share=float(entry.get("valid_share", 0.1)),
+        valid_share=float(entry.get("valid_share") or 0.1),
     )
     options = {"env": env, "env_options": entry.get("env_options"), "success": success}
     return Task(
@@ -127,5 +141,5 @@ def _make_task(name: str, entry: Mapping[str, Any]) -> Task:
         parts=None if parts is None else tuple(parts),
         horizon=entry.get("horizon"),
         success=None if success is None else "success",
-        title=str(entry.get("title", "")),
+        title=str(entry.get("title") or ""),
     )

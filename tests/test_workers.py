@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import logging
 import multiprocessing
 import os
 import pickle
@@ -25,7 +26,7 @@ from torchrl_bmrl.errors import (
     StoppedError,
     UnknownNameError,
 )
-from torchrl_bmrl.run import workers as parallel
+from torchrl_bmrl.run import workers
 from torchrl_bmrl.run.progress import Lines
 from torchrl_bmrl.run.stops import stop_on_signals
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
@@ -86,17 +87,17 @@ def die_until(job: tuple[str, Path, int], report: Report) -> str:
 
 @pytest.mark.slow
 def test_the_job_of_a_killed_worker_is_reported_and_done_again_and_no_other(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     updates: list[int] = []
     bar = type("Bar", (Lines,), {"update": lambda bar, n: updates.append(n)})
-    monkeypatch.setattr(parallel, "progress", bar)
+    monkeypatch.setattr(workers, "progress", bar)
     jobs = [(name, tmp_path, deaths) for name, deaths in zip("abcd", (0, 2, 0, 0), strict=True)]
     assert run_jobs(die_until, jobs, workers=2, **OPTIONS) == ["a", "b", "c", "d"]
     assert [len((tmp_path / name).read_text()) for name in "abcd"] == [1, 3, 1, 1]
     assert sum(updates) == 8
     assert updates.count(-1) == 2
-    said = [line for line in capfd.readouterr().err.splitlines() if "killed" in line]
+    said = [line for line in caplog.messages if "killed" in line]
     assert len(said) == 2
     assert "a worker was killed by signal 9 (out of memory?) in job 2 of 4" in said[0]
     assert "done again" in said[1]
@@ -109,7 +110,7 @@ def test_a_job_that_kills_its_worker_every_time_ends_the_run_with_a_message(
     jobs = [("fine", tmp_path, 0), ("killed", tmp_path, 9)]
     with pytest.raises(BMRLError, match=r"stage 1: training: a worker was killed.* 3rd time"):
         run_jobs(die_until, jobs, workers=2, **OPTIONS)
-    assert len((tmp_path / "killed").read_text()) == parallel.TRIES
+    assert len((tmp_path / "killed").read_text()) == workers.TRIES
 
 
 def fail_unexpectedly(job: int, report: Report) -> None:
@@ -121,7 +122,7 @@ def fail_unexpectedly(job: int, report: Report) -> None:
 def test_an_unexpected_error_of_a_worker_comes_with_its_traceback_and_the_others_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(parallel, "GRACE", 3600.0)  # nobody has to be killed
+    monkeypatch.setattr(workers, "GRACE", 3600.0)  # nobody has to be killed
     with pytest.raises(ZeroDivisionError, match="job 1") as caught:
         run_jobs(fail_unexpectedly, [1, 1], workers=2, **OPTIONS)
     assert "in fail_unexpectedly" in str(caught.value.__cause__)
@@ -146,13 +147,13 @@ def hang_once(job: tuple[str, Path], report: Report) -> str:
 
 @pytest.mark.slow
 def test_a_worker_that_hangs_is_named_and_killed_and_its_job_done_again(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Long enough for a process to start and import this.
-    monkeypatch.setattr(parallel, "SILENCE", 20.0)
+    monkeypatch.setattr(workers, "SILENCE", 20.0)
     jobs = [("hangs", tmp_path), ("fine", tmp_path)]
     assert run_jobs(hang_once, jobs, workers=2, **OPTIONS) == ["hangs", "fine"]
-    said = capfd.readouterr().err
+    said = caplog.text
     assert "a worker said nothing for 20 s and was killed in job 1 of 2; the job is done" in said
 
 
@@ -221,7 +222,7 @@ def sleep(job: int, report: Report) -> None:
 
 @pytest.mark.slow
 def test_a_worker_that_does_not_stop_in_time_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parallel, "GRACE", 1.0)
+    monkeypatch.setattr(workers, "GRACE", 1.0)
     reported: list[int] = []
 
     def update(bar: Any, units: int) -> None:
@@ -229,10 +230,50 @@ def test_a_worker_that_does_not_stop_in_time_is_killed(monkeypatch: pytest.Monke
         if len(reported) == 4:
             signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr(parallel, "progress", type("Bar", (Lines,), {"update": update}))
+    monkeypatch.setattr(workers, "progress", type("Bar", (Lines,), {"update": update}))
     with stop_on_signals(), pytest.raises(StoppedError):
         run_jobs(sleep, [1, 2], workers=2, **OPTIONS)
     assert not multiprocessing.active_children()
+
+
+LOG = logging.getLogger("torchrl_bmrl.test_workers")
+
+
+def talk(job: str, report: Report) -> str:
+    """Messages of every level, before and after a report; the last argument exists here only."""
+    for number in range(20):
+        LOG.debug("%s %d", job, number)
+        LOG.info("%s %d", job, number)
+        report(0)
+        LOG.warning("%s %d of %s", job, number, threading.current_thread())
+    return job
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("level", [logging.DEBUG, logging.INFO, logging.WARNING])
+def test_what_workers_log_reaches_the_handlers_of_this_process_once_and_in_order(
+    caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str], level: int
+) -> None:
+    caplog.set_level(level, "torchrl_bmrl")
+    assert run_jobs(talk, ["a", "b", "c"], workers=2, **OPTIONS) == ["a", "b", "c"]
+    levels = [x for x in (logging.DEBUG, logging.INFO, logging.WARNING) if x >= level]
+    for job in "abc":
+        mine = [record for record in caplog.records if record.getMessage().startswith(job)]
+        assert [record.levelno for record in mine] == levels * 20
+        numbers = [int(record.getMessage().split()[1]) for record in mine]
+        assert numbers == sorted([*range(20)] * len(levels))
+        assert {record.name for record in mine} == {LOG.name}
+    assert {record.process for record in caplog.records}.isdisjoint({os.getpid()})
+    assert capfd.readouterr().err == ""
+
+
+def test_without_processes_messages_reach_the_same_handlers(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    run_jobs(talk, ["a"], workers=1, **OPTIONS)
+    assert [message.split()[:2] for message in caplog.messages] == [
+        ["a", str(i)] for i in range(20)
+    ]
 
 
 @pytest.mark.parametrize(

@@ -171,7 +171,7 @@ CASES = {
 @pytest.mark.slow
 @pytest.mark.parametrize(("make", "batch", "members"), CASES.values(), ids=CASES)
 def test_a_compiled_update_is_one_program_and_equals_the_eager_one(
-    make: Any, batch: Any, members: int, capsys: pytest.CaptureFixture[str]
+    make: Any, batch: Any, members: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     torch.compiler.reset()
     states = []
@@ -184,7 +184,7 @@ def test_a_compiled_update_is_one_program_and_equals_the_eager_one(
             with torch._dynamo.config.patch(error_on_recompile=seed > 1):
                 metrics = update(batch(members, seed))
         states.append((loss.state_dict(), metrics))
-    assert "not accelerated" not in capsys.readouterr().err
+    assert "not accelerated" not in caplog.text
     for eager, fast in zip(*states, strict=True):
         assert eager.keys() == fast.keys()
         for key, value in eager.items():
@@ -216,7 +216,7 @@ def test_what_others_compile_beside_an_update_still_trains() -> None:
 @pytest.mark.gpu
 @pytest.mark.parametrize("compiled", [False, True])
 def test_a_captured_update_equals_the_eager_one(
-    compiled: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    compiled: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(torch, "randn", lambda *s, **o: torch.full(as_size(s), 0.3, **o))
     monkeypatch.setattr(torch, "randn_like", lambda x: torch.full_like(x, 0.3))
@@ -227,7 +227,7 @@ def test_a_captured_update_equals_the_eager_one(
         for seed in range(50):
             metrics = update(bcq_batch(3, seed, "cuda"))
         states.append((loss.state_dict(), metrics))
-    assert "not accelerated" not in capsys.readouterr().err
+    assert "not accelerated" not in caplog.text
     for eager, fast in zip(*states, strict=True):
         for key, value in eager.items():
             torch.testing.assert_close(fast[key], value, rtol=0, atol=1e-10)
@@ -347,8 +347,9 @@ def test_an_update_never_waits_for_its_device(
 
 
 def test_an_update_that_cannot_be_compiled_runs_as_it_is(
-    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
+    caplog.set_level("INFO", "torchrl_bmrl")
     calls = []
 
     def update(batch: TensorDict) -> dict[str, Tensor]:
@@ -361,7 +362,7 @@ def test_an_update_that_cannot_be_compiled_runs_as_it_is(
     batch = TensorDict({"x": torch.ones(2)}, [2])
     for _ in range(3):
         assert fast(batch)["x"] is batch["x"]
-    announced, line = capsys.readouterr().err.splitlines()
+    announced, line = caplog.messages
     assert announced == "compiling the updates, which takes about half a minute"
     assert line.startswith("updates are not accelerated (")
     assert line.endswith("they run as is")
@@ -369,11 +370,11 @@ def test_an_update_that_cannot_be_compiled_runs_as_it_is(
 
 
 def test_without_a_gpu_nothing_is_captured_and_that_is_said(
-    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     _, update = bcq_update(0)
     assert accelerate(update, captured=True) is update
-    assert capsys.readouterr().err == "device=cpu has no CUDA graphs; the updates run without\n"
+    assert caplog.messages == ["device=cpu has no CUDA graphs; the updates run without"]
 
 
 def test_an_error_of_the_update_itself_is_its_own() -> None:
