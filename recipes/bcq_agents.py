@@ -40,7 +40,6 @@ LOSS_SETTINGS = (
     "gamma",
     "max_perturbation",
     "value_bounds",
-    "target_dtype",
     "loss_function",
 )
 

@@ -20,7 +20,6 @@ from torchrl_bmrl.data.replay import check_device
 from torchrl_bmrl.errors import ConfigError, UnknownNameError
 from torchrl_bmrl.experts.controllers import ExpertGains
 from torchrl_bmrl.names import STEPPERS, TASKS, check_task, composition_stages
-from torchrl_bmrl.objectives.bcq import TARGET_DTYPES
 from torchrl_bmrl.objectives.checks import check_value_bounds
 from torchrl_bmrl.objectives.common import LOSS_FUNCTIONS
 from torchrl_bmrl.objectives.distillation import CONTEXTS, ENCODER_TERMS
@@ -73,7 +72,6 @@ class BCQSettings:
     loss_function: str = "l2"  # or l1, smooth_l1 (Huber)
     generator_warmup: int = 0  # updates of the generator alone before the critics start
     critic_grad_clip: float | None = None  # norm of the critics' gradient
-    target_dtype: str | None = None  # bfloat16 proposes and values next actions in that type
     seeds: int = 1  # agents of each task; those after the first are kept under bcq/<task>-<seed>
     stacked: bool = False  # all agents as one program, for a GPU; False: a process each
 
@@ -296,7 +294,6 @@ CHOICES = {
     "stepper": STEPPERS,
     "bcq.loss_function": LOSS_FUNCTIONS,
     "bcq.kl_reduction": KL_REDUCTIONS,
-    "bcq.target_dtype": (None, *TARGET_DTYPES),
     "distill.context": CONTEXTS,
     "distill.task_encoder": TASK_ENCODERS,
     "distill.prototype": ("mean", "medoid"),

@@ -100,7 +100,6 @@ def test_training_without_data_says_which_file_is_missing_and_who_writes_it(tmp_
         ("bcq.lr=0", "bcq.lr is 0"),
         ("bcq.seeds=0", "bcq.seeds is 0"),
         (("only=[lift]", "bcq.stacked=true"), "only is .*; valid: null with bcq.stacked"),
-        ("bcq.target_dtype=float8", "bcq.target_dtype 'float8'; .*None, bfloat16"),
         ("device=gpu", "device is 'gpu'; valid: one that torch can use"),
         ("bcq.eval_episodes=0", "bcq.eval_episodes is 0"),
         ("evaluate.episodes=-1", "evaluate.episodes is -1"),

@@ -18,7 +18,7 @@ from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.functional import unpadded
 from torchrl_bmrl.objectives.checks import check_number, whole_signature
 from torchrl_bmrl.objectives.data import entry
-from torchrl_bmrl.objectives.sizes import parts_of
+from torchrl_bmrl.objectives.sizes import agreed_sizes, check_fit, is_lazy, parts_of
 from torchrl_bmrl.objectives.swap import Weights, holding, leaves, read, without_gradient
 
 REDUCTIONS = ("mean", "sum", "none")
@@ -58,7 +58,7 @@ class KeyedLoss(LossModule):
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if "__init__" in vars(cls):
-            cls.__signature__ = whole_signature(cls, cls.fixed_options)  # type: ignore[attr-defined]
+            cls.__signature__ = whole_signature(cls, cls.fixed_options)
 
     def __init__(
         self,
@@ -76,6 +76,7 @@ class KeyedLoss(LossModule):
         self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[str] | None = None
         self._left_behind: str | None = None
+        self._cold = False  # whether a network is lazy
         self.reduction = reduction
         self.deactivate_vmap = deactivate_vmap
         self.use_prioritized_weights = use_prioritized_weights
@@ -284,6 +285,20 @@ class KeyedLoss(LossModule):
         ]
 
     # -- networks ---------------------------------------------------------------------------------
+
+    def check_sizes(self, name: str, network: Any) -> None:
+        """Compares a new network's sizes with those of the networks that the loss already has.
+
+        Args:
+            name: of the network, for the message.
+            network: the network.
+
+        Raises:
+            BMRLError: if they do not fit together.
+        """
+        others = [(key, x) for key, x in vars(self).items() if isinstance(x, nn.Module)]
+        check_fit(name, network, agreed_sizes([*others, (name, network)]))
+        self._cold = self._cold or is_lazy(network)
 
     def weights(self, name: str, *, target: bool = False, frozen: bool = False) -> Weights:
         """Parameters of a network, to be used inside :func:`.swap.holding`.

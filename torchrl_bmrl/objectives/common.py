@@ -24,9 +24,6 @@ from torchrl_bmrl.objectives.data import missing, next_key, select
 from torchrl_bmrl.objectives.ensemble import Ensemble, can_stack, copies
 from torchrl_bmrl.objectives.estimators import make_estimator, outcomes
 from torchrl_bmrl.objectives.sizes import (
-    agreed_sizes,
-    check_fit,
-    is_lazy,
     parts_of,
     shapes_of,
     warm_up,
@@ -104,7 +101,6 @@ class OfflineLoss(KeyedLoss):
         if loss_function not in LOSS_FUNCTIONS:
             raise UnknownNameError("loss_function", loss_function, LOSS_FUNCTIONS)
         self._gamma = check_number("gamma", gamma, 0, 1)
-        self._cold = False
         self.loss_function = loss_function
         self.separate_losses = separate_losses
 
@@ -131,7 +127,7 @@ class OfflineLoss(KeyedLoss):
                 initialised anew.
         """
         several = isinstance(qvalue_network, (Sequence, nn.ModuleList))
-        given = list(qvalue_network) if several else [qvalue_network]
+        given: list[Any] = list(qvalue_network) if several else [qvalue_network]
         for critic in given:
             check_network("a critic" if several else "qvalue_network", critic)
             self.check_sizes("qvalue_network", critic)
@@ -169,20 +165,6 @@ class OfflineLoss(KeyedLoss):
     def _parameters_changed(self) -> None:
         super()._parameters_changed()
         self._shared_with_generator = shared_keys(self)
-
-    def check_sizes(self, name: str, network: Any) -> None:
-        """Compares a new network's sizes with those of the networks that the loss already has.
-
-        Args:
-            name: of the network, for the message.
-            network: the network.
-
-        Raises:
-            BMRLError: if they do not fit together.
-        """
-        others = [(key, x) for key, x in vars(self).items() if isinstance(x, nn.Module)]
-        check_fit(name, network, agreed_sizes([*others, (name, network)]))
-        self._cold = self._cold or is_lazy(network)
 
     def _warm_up(self, tensordict: TensorDictBase, batch: torch.Size) -> None:
         """Gives lazy networks their parameters, by the sizes of the first batch."""

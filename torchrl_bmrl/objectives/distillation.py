@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,16 +13,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn import functional as F
 
+from torchrl_bmrl import functional
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.functional import (
-    average,
-    direction_error,
-    isometry_error,
-    sample_action_latent,
-    squared_error,
-    triplet_error,
-    unpadded,
-)
 from torchrl_bmrl.generators import written
 from torchrl_bmrl.objectives.base import KeyedLoss
 from torchrl_bmrl.objectives.checks import check_number
@@ -54,14 +46,13 @@ class MetaDistillationLoss(KeyedLoss):
 
     Deviations from the paper are the penalty on m, the normalised :math:`\tilde Q_i = (Q_i -
     \mu_i)/\sigma_i` and ``context``; docs/distillation.md explains them. The last two terms are off
-    by default. In the triplet loss (https://arxiv.org/abs/1909.11373) :math:`m^+` embeds another
-    transition of the task and :math:`m^-` one of another task. The isometry term makes distances in
-    m those of c, the reward and the teacher's action, over all pairs of a task's rows.
-    :math:`\hat Q` is trained at :math:`\hat g` without a gradient into the student's generator.
+    by default: in the triplet loss (https://arxiv.org/abs/1909.11373) :math:`m^+` embeds another
+    transition of the task and :math:`m^-` one of another task; the isometry term makes distances in
+    m those of reward and teacher's action c, over all pairs of a task's rows. :math:`\hat Q` is
+    trained at :math:`\hat g` without a gradient into the student's generator.
 
-    The teachers are frozen: row i of the data is task i. Any decoder and critic will do, as of
-    :class:`~torchrl_bmrl.objectives.BCQLoss`; teachers of equal shapes run as one batched ensemble.
-    A perturbation network is not distilled.
+    The teachers are frozen: row i of the data is task i. Any decoders and critics will do; those of
+    equal shapes run as one batched ensemble. A perturbation network is not distilled.
 
     Args:
         task_encoder: M, (observation, action, next reward, next observation) → ``task_latent``.
@@ -82,26 +73,24 @@ class MetaDistillationLoss(KeyedLoss):
         metric_margin: α, in units of m.
         isometry_weight: w_s; 0 leaves the term out.
         encoder_terms: terms whose gradient reaches M, of ``"classification"``, ``"generator"``,
-            ``"direction"``, ``"qvalue"`` and ``"metric"``. The penalty on m and the isometry term
+            ``"direction"``, ``"qvalue"`` and ``"metric"``; the penalty on m and the isometry term
             always reach it. ``("classification",)`` is the paper's reading.
         context: which transition m is computed from: ``"current"`` (the paper's), ``"previous"``
             (the one before it in the episode, under the key ``"previous"``), ``"random"`` (another
             one of the task in the batch) or ``"set"`` (the mean over ``context_size`` random ones).
-        context_fraction: share of each batch whose m comes from ``context``; the rest uses
-            ``"current"``.
+        context_fraction: share of each batch that uses ``context``; the rest uses ``"current"``.
         context_size: transitions in a set.
         **options: of :class:`~torchrl_bmrl.objectives.KeyedLoss`: ``reduction``,
             ``deactivate_vmap`` (runs the teachers in a loop), ``use_prioritized_weights``.
 
     Keys read, batch ``[num_tasks, B]``: ``observation``, ``action``, ``("next", "reward")``,
-    ``("next", "observation")``, ``task`` (class index, int64), and with ``context="previous"`` the
-    same transition keys under ``"previous"``. Key written to the input: ``td_error
-    (num_tasks, B)``, the priority: the sum of a row's terms.
+    ``("next", "observation")``, ``task`` (class index, int64), with ``context="previous"`` the same
+    under ``"previous"``. Key written to the input: ``td_error (num_tasks, B)``, the priority: the
+    sum of a row's terms.
 
     Raises:
-        BMRLError: for teachers or options that are not valid; and at a call for data whose first
-            dimension is not the number of teachers, with missing keys or, on CPU and not compiled,
-            numbers that are not finite.
+        BMRLError: for invalid teachers or options; and at a call for data without one row per
+            teacher, with missing keys or, on CPU and not compiled, numbers that are not finite.
 
     Example:
         >>> from torchrl_bmrl import modules
@@ -189,8 +178,6 @@ class MetaDistillationLoss(KeyedLoss):
         for term in encoder_terms:
             if term not in ENCODER_TERMS:
                 raise UnknownNameError("encoder term", term, ENCODER_TERMS)
-        metric_weight = check_number("metric_weight", metric_weight)
-        isometry_weight = check_number("isometry_weight", isometry_weight)
         if metric_weight and len(teacher_generators) < 2:
             raise BMRLError("metric_weight needs at least two tasks")
         self.num_tasks = len(teacher_generators)
@@ -200,12 +187,9 @@ class MetaDistillationLoss(KeyedLoss):
         self.context_size = check_number("context_size", context_size, 1, integer=True)
         self.encoder_terms = encoder_terms
         self.metric_margin = check_number("metric_margin", metric_margin)
-        students = {
-            "task_encoder": task_encoder,
-            "task_classifier": task_classifier,
-            "student_generator": student_generator,
-            "student_qvalue_network": student_qvalue_network,
-        }
+        names = ("task_encoder", "task_classifier", "student_generator", "student_qvalue_network")
+        networks = (task_encoder, task_classifier, student_generator, student_qvalue_network)
+        students = dict(zip(names, networks, strict=True))
         teachers = (teacher_generators, teacher_qvalue_networks)
         check_teachers(students, *teachers, self.tensor_keys.action_latent, self.latent_dim)
         self._cold = any(map(is_lazy, students.values()))
@@ -307,12 +291,7 @@ class MetaDistillationLoss(KeyedLoss):
         return self._run("task_encoder", data, self.tensor_keys.task_latent)
 
     def _run(
-        self,
-        name: str,
-        data: TensorDictBase,
-        key: NestedKey,
-        like: Tensor | None = None,
-        extra: Mapping[NestedKey, Tensor] | None = None,
+        self, name: str, data: Any, key: NestedKey, like: Tensor | None = None, extra: Any = None
     ) -> Tensor:
         """Output of a trained network for data and extra entries, with the shape of ``like``."""
         for entry_key, value in (extra or {}).items():
@@ -324,19 +303,11 @@ class MetaDistillationLoss(KeyedLoss):
 
     @torch.no_grad()
     def teach(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Actions and normalised values of the teachers for freshly drawn latents.
-
-        Returns:
-            batch ``[num_tasks, B]`` with ``observation``, ``action_latent``, ``action`` and
-            ``state_action_value (num_tasks, B, 1)``.
-        """
+        """States, fresh latents, and the teachers' actions and normalised values for them."""
         keys = self.tensor_keys
-        latent = sample_action_latent(
-            (*tensordict.batch_size, self.latent_dim),
-            latent_clip=self.latent_clip,
-            device=self.qvalue_loc.device,
-            dtype=self.qvalue_loc.dtype,
-        )
+        shape = (*tensordict.batch_size, self.latent_dim)
+        clip, like = self.latent_clip, self._type_and_device
+        latent = functional.sample_action_latent(shape, latent_clip=clip, **like)
         data = self._ask(self.teacher_qvalue_networks, self._demonstrate(tensordict, latent))
         value = data.get(keys.state_action_value)
         value = (value - self.qvalue_loc[:, None, None]) / self.qvalue_scale[:, None, None]
@@ -361,24 +332,22 @@ class MetaDistillationLoss(KeyedLoss):
             action = self._demonstrate(tensordict, centre).get(self.tensor_keys.action)
         content = torch.cat([reward / self.reward_scale[:, None, None], action], -1)
         # Not embed(): a set has no reward and action of its own.
-        return isometry_error(self._encode(tensordict), content, valid)
+        return functional.isometry_error(self._encode(tensordict), content, valid)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the weighted terms; the class lists the keys.
 
         Raises:
-            BMRLError: for data that do not fit, as the class says.
+            BMRLError: for data that do not fit.
         """
         self.check_names()
         if self._cold:
             self._warm_up(tensordict)
         batch, keys = tensordict.batch_size, self.tensor_keys
-        if tensordict.ndim != 2 or batch[0] != self.num_tasks:
-            raise BMRLError(
-                f"the data's batch size is {list(batch)}; valid: [{self.num_tasks}, B], one row "
-                "per teacher"
-            )
+        if len(batch) != 2 or batch[0] != self.num_tasks:
+            valid_batch = f"[{self.num_tasks}, B], one row per teacher"
+            raise BMRLError(f"the data's batch size is {list(batch)}; valid: {valid_batch}")
         valid = self.valid_rows(tensordict, batch)
         task = entry(tensordict, keys.task, valid)
         check_tasks(keys.task, task, batch, valid)
@@ -412,20 +381,20 @@ class MetaDistillationLoss(KeyedLoss):
         norm = m.square().sum(-1)
         terms = {
             "loss_classification": self.classification_weight * cross_entropy.view_as(task),
-            "loss_generator": self.generator_weight * squared_error(action, target),
-            "loss_direction": self.direction_weight * direction_error(directed, target),
+            "loss_generator": self.generator_weight * functional.squared_error(action, target),
+            "loss_direction": self.direction_weight * functional.direction_error(directed, target),
             "loss_qvalue": self.qvalue_weight * error.square(),
             "loss_latent_norm": self.latent_norm_weight * norm,
         }
         if self.metric_weight is not None:
             near, far = draw_others(reaching["metric"], valid)
-            triplet = triplet_error(reaching["metric"], near, far, self.metric_margin)
+            triplet = functional.triplet_error(reaching["metric"], near, far, self.metric_margin)
             terms["loss_metric"] = self.metric_weight * triplet
         if self.isometry_weight is not None:
             terms["loss_isometry"] = self.isometry_weight * self._isometry(tensordict)
         priority = sum(terms.values()).detach()
-        tensordict.set(self.tensor_keys.priority, unpadded(priority, valid))
+        tensordict.set(self.tensor_keys.priority, functional.unpadded(priority, valid))
         losses = {name: self.reduce(term, tensordict) for name, term in terms.items()}
-        losses["accuracy"] = average((logits.argmax(-1) == task).to(logits.dtype), valid)
-        losses["latent_norm"] = average(norm, valid).sqrt()
+        losses["accuracy"] = functional.average((logits.argmax(-1) == task).to(logits.dtype), valid)
+        losses["latent_norm"] = functional.average(norm, valid).sqrt()
         return TensorDict(losses)

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
@@ -17,8 +17,14 @@ from torchrl.objectives.value import TD0Estimator
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.objectives.data import entry
-from torchrl_bmrl.objectives.ensemble import kind
-from torchrl_bmrl.objectives.sizes import is_lazy
+from torchrl_bmrl.objectives.stacking import (
+    are_equal,
+    check_members,
+    is_trained,
+    join,
+    stack_params,
+    state_of,
+)
 from torchrl_bmrl.ownership import note_copied
 
 Self = TypeVar("Self", bound="StackedLoss")
@@ -99,7 +105,7 @@ class StackedLoss(LossModule):
         super().__init__()
         losses = list(losses)
         names = [str(i) for i in range(len(losses))] if names is None else list(names)
-        _check_members(losses, names)
+        check_members(losses, names)
         self.names = names
         self.deactivate_vmap = deactivate_vmap
         # Outside _modules: their own parameters are not state of the stack.
@@ -108,13 +114,13 @@ class StackedLoss(LossModule):
             for network in (loss, *(x for x in vars(loss).values() if isinstance(x, nn.Module))):
                 note_copied(network, type(self).__name__)
         template = deepcopy(losses[0])
-        own = [_state(loss) for loss in losses]
+        own = [state_of(loss) for loss in losses]
         self._paths: dict[str, str] = {}
         for path in own[0]:
             values = [state[path] for state in own]
             nested = "." in path or isinstance(values[0], Tensor)
             coefficient = path in getattr(template, "_coefficients", ())
-            if nested and not coefficient and not _trained(values[0]) and _equal(values):
+            if nested and not coefficient and not is_trained(values[0]) and are_equal(values):
                 continue  # equal in all members: the template's is used
             if isinstance(template.get_submodule(path.rpartition(".")[0]), nn.ModuleList):
                 raise BMRLError(f"{path!r} differs between the losses; valid: equal ones")
@@ -123,7 +129,7 @@ class StackedLoss(LossModule):
             if isinstance(values[0], Tensor):
                 self.register_buffer(name, torch.stack(values))
             else:
-                setattr(self, name, _stack(values))
+                setattr(self, name, stack_params(values))
         self.__dict__["_template"] = template
         # SoftUpdate and HardUpdate record here what they update.
         self._has_update_associated = {
@@ -199,7 +205,7 @@ class StackedLoss(LossModule):
         for index in range(len(self)):
             loss = self.member(index)
             loss.reset_parameters_recursive()
-            own = _state(loss)
+            own = state_of(loss)
             with torch.no_grad():
                 for name, path in self._paths.items():
                     self._held(name)[index].copy_(own[path])
@@ -260,7 +266,7 @@ class StackedLoss(LossModule):
         loss = self._losses[index]
         reference = next(self.parameters())
         loss.to(dtype=reference.dtype, device=reference.device)
-        own = _state(loss)
+        own = state_of(loss)
         with torch.no_grad():
             for name, path in self._paths.items():
                 own[path].copy_(self._held(name)[index])
@@ -306,7 +312,7 @@ class StackedLoss(LossModule):
             for row, data in zip(rows, tensordict.unbind(0), strict=True):
                 with self._holding(dict(zip(state, row, strict=True))) as loss:
                     results.append(function(loss, data))
-            return _join(results)
+            return join(results)
         shape = getattr(self._template, "batch_shape", lambda data: data.batch_size)
         valid = self._template.valid_rows(tensordict, shape(tensordict))
         for key in self.in_keys:
@@ -354,76 +360,3 @@ def _passed_on(template: LossModule, name: str) -> bool:
     if name == "gamma" or name in getattr(template, "_coefficients", ()):
         return hasattr(template, name)
     return name in vars(template) and not name.startswith("_") and name != "training"
-
-
-def _state(loss: LossModule) -> dict[str, Any]:
-    """Parameters and buffers of a loss by path: TensorDicts, and tensors outside them."""
-    state: dict[str, Any] = {}
-    for path, module in loss.named_modules():
-        if isinstance(module, TensorDictParams):
-            state[path] = module._param_td
-        else:
-            prefix = f"{path}." if path else ""
-            buffers = module.named_buffers(recurse=False)
-            state |= {f"{prefix}{name}": buffer for name, buffer in buffers}
-    return state
-
-
-def _leaves(value: Any) -> list[Tensor]:
-    return [value] if isinstance(value, Tensor) else list(value.values(True, True))
-
-
-def _trained(value: Any) -> bool:
-    return any(leaf.requires_grad for leaf in _leaves(value))
-
-
-def _equal(values: Sequence[Any]) -> bool:
-    first, *others = map(_leaves, values)
-    return all(all(map(torch.equal, first, other)) for other in others)
-
-
-def _stack(values: Sequence[TensorDictBase]) -> TensorDictParams:
-    """Members' parameters and buffers stacked along a new first dimension."""
-    stacked: Any = torch.stack([value.data for value in values]).contiguous()
-    for key, leaf in values[0].items(True, True):
-        if leaf.requires_grad:
-            stacked.set(key, nn.Parameter(stacked.get(key)))
-        elif isinstance(leaf, nn.Buffer):
-            stacked.set(key, nn.Buffer(stacked.get(key)))
-    return TensorDictParams(stacked, no_convert="skip")
-
-
-def _join(results: Sequence[Any]) -> Any:
-    """Stacks what the members returned: tensors, in tuples and dicts."""
-    first = results[0]
-    if isinstance(first, Tensor):
-        return torch.stack(list(results))
-    if isinstance(first, dict):
-        return {key: _join([result[key] for result in results]) for key in first}
-    if isinstance(first, tuple):
-        return tuple(map(_join, zip(*results, strict=True)))
-    return first
-
-
-def _kind(loss: LossModule) -> tuple[Any, ...]:
-    """Everything in which the members of a stack must be equal."""
-    return type(loss), kind(loss), loss.tensor_keys, loss.in_keys, loss.loss_mask_key
-
-
-def _check_members(losses: Sequence[LossModule], names: Sequence[str]) -> None:
-    if not losses or len(names) != len(losses) or len(set(names)) < len(names):
-        raise BMRLError(
-            f"{len(losses)} losses named {list(names)}; valid: at least one, each with its own name"
-        )
-    if any(map(is_lazy, losses)):
-        raise BMRLError("a loss has parameters without a shape; valid: losses that have run once")
-    for name, loss in zip(names, losses, strict=True):
-        if _kind(loss) != _kind(losses[0]):
-            raise BMRLError(
-                f"loss {name!r} differs from {names[0]!r} in kind, keys, networks or options; "
-                "valid: equal ones, but for parameters and coefficients"
-            )
-    held = [leaf for loss in losses for part in _state(loss).values() for leaf in _leaves(part)]
-    trained = [id(leaf) for leaf in held if leaf.requires_grad]
-    if len(set(trained)) < len(trained):
-        raise BMRLError("networks of the losses share parameters; valid: each network has its own")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 from weakref import WeakKeyDictionary
 
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from torchrl_bmrl.errors import BMRLError
 
-Weights = TensorDictBase | list[Tensor]
+Weights: TypeAlias = TensorDictBase | list[Tensor]
 """Parameters and buffers of a module: as ``TensorDict.from_module`` has them, or a flat list."""
 
 _PATHS: WeakKeyDictionary[nn.Module, list[tuple[str, ...]]] = WeakKeyDictionary()
