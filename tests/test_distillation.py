@@ -197,7 +197,7 @@ def test_metric_term_is_the_triplet_error_of_rows_of_the_same_and_another_task(
         calls.append(inputs)
         return triplet_error(*inputs)
 
-    monkeypatch.setattr(distillation, "triplet_error", spy)
+    monkeypatch.setattr(functional, "triplet_error", spy)
     loss = make_distillation_loss(metric_weight=0.5, metric_margin=0.3, reduction="none")
     data = task_transitions(TASKS, 20)
     value = run(loss, data)["loss_metric"].detach().numpy()

@@ -14,7 +14,10 @@ from __future__ import annotations
 import inspect
 import re
 from dataclasses import field, make_dataclass
-from typing import Any, Union
+from functools import reduce
+from operator import or_
+from types import NoneType
+from typing import Any
 
 from torchrl_bmrl import objectives
 from torchrl_bmrl.extras import needs
@@ -33,14 +36,16 @@ __all__ = [
     "StackedLossConfig",
 ]
 
-_PLAIN = {"int": int, "float": float, "str": str, "bool": bool, "None": None}
+_PLAIN = {"int": int, "float": float, "str": str, "bool": bool, "None": NoneType}
 """Types that Hydra checks; a field of another type takes anything."""
 
 
 def _type(annotation: str) -> Any:
     """The type of a field, such as ``float | None``; ``Any`` for what is not a plain value."""
     parts = annotation.split(" | ")
-    return Union[tuple(_PLAIN[x] for x in parts)] if set(parts) <= _PLAIN.keys() else Any
+    if not set(parts) <= _PLAIN.keys():
+        return Any
+    return reduce(or_, (_PLAIN[part] for part in parts))
 
 
 def _configuration(loss: type) -> Any:
