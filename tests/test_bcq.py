@@ -320,25 +320,3 @@ def test_a_network_that_writes_another_key_or_has_none_is_named() -> None:
 
 
 # -- targets in another type -----------------------------------------------------------------------
-
-
-def test_bfloat16_targets_are_near_float32_ones_and_the_losses_stay_float32() -> None:
-    data = transitions(64, dtype=torch.float32)
-    results = {}
-    for target_dtype in (None, "bfloat16"):
-        loss = make_bcq_loss(dtype=torch.float32, target_dtype=target_dtype, num_candidates=50)
-        torch.manual_seed(1)
-        value, info = loss.qvalue_loss(data)
-        value.backward()
-        grads = [p.grad for p in loss.qvalue_network_params.parameters()]
-        assert {x.dtype for x in (value, info["td_error"], *grads)} == {torch.float32}
-        results[target_dtype] = info
-    exact, near = (float(info["next_state_value"]) for info in results.values())
-    assert exact != near
-    assert near == pytest.approx(exact, abs=0.02)
-    torch.testing.assert_close(results[None]["pred_value"], results["bfloat16"]["pred_value"])
-
-
-def test_an_unknown_target_type_is_refused() -> None:
-    with pytest.raises(BMRLError, match="unknown target_dtype 'float8'"):
-        make_bcq_loss(target_dtype="float8")

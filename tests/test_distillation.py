@@ -33,6 +33,7 @@ from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.functional import triplet_error
 from torchrl_bmrl.modules import PLASPolicy, make_decoder, make_qvalue_network
 from torchrl_bmrl.objectives import MetaDistillationLoss, distillation
+from torchrl_bmrl.objectives.task_rows import draw_others
 
 Teachers = tuple[list[TensorDictModule], list[TensorDictModule]]
 TASKS, ROWS = 3, 5
@@ -196,7 +197,7 @@ def test_metric_term_is_the_triplet_error_of_rows_of_the_same_and_another_task(
         calls.append(inputs)
         return triplet_error(*inputs)
 
-    monkeypatch.setattr(distillation, "triplet_error", spy)
+    monkeypatch.setattr(functional, "triplet_error", spy)
     loss = make_distillation_loss(metric_weight=0.5, metric_margin=0.3, reduction="none")
     data = task_transitions(TASKS, 20)
     value = run(loss, data)["loss_metric"].detach().numpy()
@@ -221,11 +222,11 @@ def test_metric_term_is_the_triplet_error_of_rows_of_the_same_and_another_task(
 
 
 def test_metric_term_is_zero_where_the_tasks_lie_far_apart() -> None:
-    loss = make_distillation_loss(metric_weight=1.0, metric_margin=1.0)
     centre = 10.0 * torch.eye(TASKS, 2, dtype=torch.float64).unsqueeze(1)
     spread = torch.rand(TASKS, ROWS, 2, dtype=torch.float64)
-    assert loss.separate(centre + spread).eq(0).all()
-    assert loss.separate(spread).gt(0).any()
+    apart, mixed = (x.expand(TASKS, ROWS, 2) for x in (centre + spread, spread))
+    assert triplet_error(apart, *draw_others(apart, None), 1.0).eq(0).all()
+    assert triplet_error(mixed, *draw_others(mixed, None), 1.0).gt(0).any()
 
 
 def test_metric_term_needs_two_tasks() -> None:
@@ -248,7 +249,7 @@ def test_isometry_error_compares_distances_within_a_task_alone() -> None:
     )
     data = batch()
     found = run(loss, data)["loss_isometry"]
-    m = loss._encode(data.select(*loss.task_encoder.in_keys)).detach()
+    m = loss._encode(data).detach()
     for task, generator in enumerate(teachers[0]):
         asked = data[task].select("observation")
         asked["action_latent"] = torch.zeros(*asked.batch_size, LATENT_DIM, dtype=m.dtype)

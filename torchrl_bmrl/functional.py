@@ -323,3 +323,35 @@ def nonzero_scale(scale: Tensor, largest: Tensor, dtype: torch.dtype) -> Tensor:
     rounding = 2 * torch.finfo(dtype).eps * largest
     noise = rounding.clamp_min(1e-12 if dtype == torch.float64 else 1e-7)
     return torch.where(scale > noise, scale, 1.0)
+
+
+def unpadded(value: Tensor, valid: Tensor | None) -> Tensor:
+    """The numbers of each row, with 0 in the rows that a mask leaves out.
+
+    Args:
+        value: ``(..., *B)``.
+        valid: which rows count, ``(*B,)``; ``None`` if all do.
+
+    Example:
+        >>> unpadded(torch.tensor([1.0, torch.nan]), torch.tensor([True, False]))
+        tensor([1., 0.])
+    """
+    return value if valid is None else torch.where(valid, value, torch.zeros_like(value))
+
+
+def average(value: Tensor, valid: Tensor | None) -> Tensor:
+    """Mean of a metric over the rows that count, detached.
+
+    Args:
+        value: ``(..., *B)``.
+        valid: which rows count, ``(*B,)``; ``None`` if all do.
+
+    Example:
+        >>> average(torch.tensor([1.0, 7.0]), torch.tensor([True, False]))
+        tensor(1.)
+    """
+    value = value.detach()
+    if valid is None:
+        return value.mean()
+    number = valid.sum().clamp(min=1) * (value.numel() // valid.numel())
+    return unpadded(value, valid).sum() / number

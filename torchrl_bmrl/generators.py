@@ -1,22 +1,22 @@
-r"""What a generator of actions is: what the losses and policies ask of it.
+r"""Generators: models that propose actions. This is what the losses and policies ask of one.
 
-A generator models the actions of the data. Any module serves that has these members:
+A generator models the actions of the data. It is any module with these members:
 
 ============  =====================================================================================
 ``in_keys``   keys that it reads of a state
 ``metrics``   names of the numbers that ``row_loss`` returns beside its loss
-``options``   which options of a loss it takes: names of :data:`LOSS_OPTIONS`, ``PROPOSAL_OPTIONS``
+``options``   options of a loss that it takes: names of :data:`LOSS_OPTIONS`, ``PROPOSAL_OPTIONS``
 ``row_loss``  ``(tensordict, keys, **options)`` returns its own loss of each row, ``(*B,)``, and a
               dict of metrics, ``(*B,)`` each. ``tensordict`` has the state's keys and the action.
 ``propose``   ``(observation, num_candidates, keys, **options)`` returns a TensorDict
               ``[*B, num_candidates]`` with the state's keys and a freshly drawn action for each
 ============  =====================================================================================
 
-``keys`` names the entries: ``keys.action``, ``keys.action_latent`` and so on, see
-:class:`ActionKeys`. Where the action depends on a latent z alone, a generator also has
-``latent_dim`` and ``decode(tensordict, keys)``, which PLAS and the distillation need. Where it says
-``sizes`` (key to size) or ``bounds`` (of its actions), the losses compare these with the other
-networks and with the bounds that they are given.
+``keys`` contains the names of the entries: ``keys.action``, ``keys.action_latent`` and so on, see
+:class:`ActionKeys`. Where the action is a function of the state and a latent z, a generator also
+has ``latent_dim`` and ``decode(tensordict, keys)``, which PLAS and the distillation need. Where it
+has ``sizes`` (key to size) or ``bounds`` (of its actions), the losses compare these with the other
+networks and with their own bounds.
 
 :class:`Autoencoder` is the generator of the published algorithms.
 """
@@ -24,7 +24,7 @@ networks and with the bounds that they are given.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -40,16 +40,7 @@ LOSS_OPTIONS = ("kl_weight", "kl_reduction")
 PROPOSAL_OPTIONS = ("latent_clip",)
 """Options of a loss that a generator's ``propose`` may take."""
 PARTS = ("encoder", "decoder", "latent_dim")
-"""What makes a module an autoencoder."""
-
-
-class Keys(Protocol):
-    """Names of the entries that a generator reads and writes."""
-
-    action: NestedKey
-    action_latent: NestedKey
-    action_latent_loc: NestedKey
-    action_latent_scale: NestedKey
+"""Members that make a module an autoencoder."""
 
 
 @dataclass
@@ -114,19 +105,19 @@ class Autoencoder(TensorDictModuleBase):
 
     @property
     def sizes(self) -> dict[NestedKey, int]:
-        """Sizes of the entries, as far as encoder and decoder say them."""
+        """Sizes of the entries, as far as encoder and decoder declare them."""
         parts = (self.encoder, self.decoder)
         return {k: size for part in parts for k, size in getattr(part, "sizes", {}).items()}
 
     @property
     def bounds(self) -> tuple[Tensor, Tensor] | None:
-        """Bounds of the actions, where the decoder says them."""
+        """Bounds of the actions, if the decoder declares them."""
         return getattr(self.decoder, "bounds", None)
 
     def row_loss(
-        self, tensordict: TensorDictBase, keys: Keys, *, kl_weight: Any, kl_reduction: str
+        self, tensordict: TensorDictBase, keys: ActionKeys, *, kl_weight: Any, kl_reduction: str
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        r"""Variational autoencoder's loss of each row.
+        r"""Loss of the variational autoencoder for each row.
 
         .. math:: \lVert G(s, z) - a \rVert^2 / |a|
             + \beta\, \mathrm{KL}(q(z|s,a)\,\|\,N(0, I)) / |z|,\quad z \sim q(z|s,a)
@@ -162,9 +153,14 @@ class Autoencoder(TensorDictModuleBase):
         return error + kl_weight * divergence, metrics
 
     def propose(
-        self, observation: TensorDictBase, num_candidates: int, keys: Keys, *, latent_clip: Any
+        self,
+        observation: TensorDictBase,
+        num_candidates: int,
+        keys: ActionKeys,
+        *,
+        latent_clip: Any,
     ) -> TensorDictBase:
-        """Actions decoded from z ~ N(0, I), a draw for every candidate.
+        """Actions decoded from z ~ N(0, I), with a new draw for every candidate.
 
         Args:
             observation: what the decoder reads beside z, batch ``[*B]``.
@@ -180,11 +176,11 @@ class Autoencoder(TensorDictModuleBase):
             self.decoder, observation, num_candidates, self.latent_dim, keys, latent_clip, weight
         )
 
-    def encode(self, tensordict: TensorDictBase, keys: Keys) -> TensorDictBase:
+    def encode(self, tensordict: TensorDictBase, keys: ActionKeys) -> TensorDictBase:
         """The data with mean and standard deviation of the posterior of z.
 
         Args:
-            tensordict: observation and action, batch ``[*B]``; it is left as it is.
+            tensordict: observation and action, batch ``[*B]``; it is not changed.
             keys: names of the entries.
 
         Raises:
@@ -192,11 +188,11 @@ class Autoencoder(TensorDictModuleBase):
         """
         data = self.encoder(tensordict.copy())
         for key in (keys.action_latent_loc, keys.action_latent_scale):
-            check_written(data, key, self.encoder)
+            written(data, key, self.encoder)
         return data
 
-    def decode(self, tensordict: TensorDictBase, keys: Keys) -> TensorDictBase:
-        """The data with the action that the latent stands for.
+    def decode(self, tensordict: TensorDictBase, keys: ActionKeys) -> TensorDictBase:
+        """The data with the action decoded from the latent.
 
         Args:
             tensordict: observation and z, batch ``[*B]``; the action is written into it.
@@ -206,7 +202,7 @@ class Autoencoder(TensorDictModuleBase):
             BMRLError: if the decoder writes another key than the action's.
         """
         data = self.decoder(tensordict)
-        check_written(data, keys.action, self.decoder)
+        written(data, keys.action, self.decoder)
         return data
 
 
@@ -215,11 +211,11 @@ def decode_draws(
     observation: TensorDictBase,
     num_candidates: int,
     latent_dim: int,
-    keys: Keys,
+    keys: ActionKeys,
     latent_clip: Any,
     like: Tensor,
 ) -> TensorDictBase:
-    """Actions that a decoder makes of z ~ N(0, I), a draw for every candidate.
+    """Actions decoded from z ~ N(0, I), with a new draw for every candidate.
 
     Args:
         decoder: (observation, ``action_latent`` → action).
@@ -228,7 +224,7 @@ def decode_draws(
         latent_dim: size of z.
         keys: names of the entries.
         latent_clip: bound on each dimension of z, ``None`` for none.
-        like: a tensor whose type and device z has.
+        like: a tensor with the dtype and device of z.
 
     Returns:
         batch ``[*B, num_candidates]`` with the observation, z and the action.
@@ -253,7 +249,7 @@ def decode_draws(
 
 
 def candidates(observation: TensorDictBase, num_candidates: int) -> TensorDictBase:
-    """The observation once for every candidate, without a copy.
+    """The observation repeated for every candidate, without a copy.
 
     Args:
         observation: batch ``[*B]``.
@@ -271,8 +267,8 @@ def candidates(observation: TensorDictBase, num_candidates: int) -> TensorDictBa
     return observation.unsqueeze(-1).expand(*batch, num_candidates)
 
 
-def check_written(tensordict: TensorDictBase, key: NestedKey, network: TensorDictModule) -> Tensor:
-    """What a network wrote under a key.
+def written(tensordict: TensorDictBase, key: NestedKey, network: TensorDictModule) -> Tensor:
+    """The entry that a network has written, checked.
 
     Args:
         tensordict: the network's output.
@@ -289,7 +285,7 @@ def check_written(tensordict: TensorDictBase, key: NestedKey, network: TensorDic
         >>> data = TensorDict(
         ...     {"observation": torch.zeros(1, 3), "action_latent": torch.zeros(1, 4)}
         ... )
-        >>> check_written(decoder(data), "action", decoder).shape
+        >>> written(decoder(data), "action", decoder).shape
         torch.Size([1, 2])
     """
     value = tensordict.get(key, None)
@@ -301,8 +297,40 @@ def check_written(tensordict: TensorDictBase, key: NestedKey, network: TensorDic
     return value
 
 
+def check_bounds(bounds: Any, network: Any, size: int | None = None) -> None:
+    """Checks that bounds of the action are those that a generator or decoder declares.
+
+    Args:
+        bounds: ``(low, high)``, numbers or tensors.
+        network: a network that may have ``bounds``.
+        size: of an action, where it is known.
+
+    Raises:
+        BMRLError: for bounds of another length, or other bounds than the network's.
+
+    Example:
+        >>> from torchrl_bmrl.modules import ActionVAE
+        >>> check_bounds((-1.0, 1.0), ActionVAE(3, 2))
+    """
+    own = getattr(network, "bounds", None) or bounds
+    for name, bound, other in zip(("lower", "upper"), bounds, own, strict=True):
+        bound, other = (torch.as_tensor(x).double().cpu() for x in (bound, other))
+        if size is not None and bound.ndim and len(bound) != size:
+            raise BMRLError(
+                f"the {name} bound of the action has {len(bound)} numbers; valid: a number, or "
+                f"{size}, the size of the generator's actions"
+            )
+        alike = not (bound.ndim and other.ndim) or len(bound) == len(other)
+        if not alike or not torch.allclose(*torch.broadcast_tensors(bound, other)):
+            raise BMRLError(
+                f"the {name} bound of the action is {bound.tolist()}, and the generator's "
+                f"{other.tolist()}; valid: equal ones, such as "
+                "ActionVAE(..., bounds=(spec.space.low, spec.space.high))"
+            )
+
+
 def as_generator(module: Any) -> Any:
-    """The module as a generator: itself, or the autoencoder that its parts make.
+    """The module as a generator: itself, or an autoencoder made of its parts.
 
     Args:
         module: a generator, or a module with ``encoder``, ``decoder`` and ``latent_dim``.

@@ -8,7 +8,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.objectives.checks import check_number, missing, next_key
+from torchrl_bmrl.objectives.checks import check_number
+from torchrl_bmrl.objectives.data import missing, next_key
 
 STEPS_KEY = "steps_to_next_obs"
 EPISODE_KEYS: tuple[NestedKey, ...] = (("collector", "traj_ids"), "episode")

@@ -1,6 +1,7 @@
-"""Networks, the acting policy, and the task embedding."""
+"""Networks, policies, and the task embedding."""
 
-from torchrl_bmrl.modules.following import extract_critic, extract_network
+from torchrl_bmrl.modules.discrete_policy import DiscreteBCQPolicy
+from torchrl_bmrl.modules.following import LossPolicy, extract_critic, extract_network
 from torchrl_bmrl.modules.generator import (
     ActionVAE,
     make_decoder,
@@ -9,7 +10,7 @@ from torchrl_bmrl.modules.generator import (
     make_qvalue_network,
 )
 from torchrl_bmrl.modules.latent_action import HeldTaskLatent, task_latent_box
-from torchrl_bmrl.modules.policy import BCQPolicy, DiscreteBCQPolicy, PLASPolicy
+from torchrl_bmrl.modules.policy import BCQPolicy, PLASPolicy
 from torchrl_bmrl.modules.task_latent import (
     DemonstrationTaskLatent,
     OnlineTaskLatent,
@@ -28,6 +29,7 @@ __all__ = [
     "DemonstrationTaskLatent",
     "DiscreteBCQPolicy",
     "HeldTaskLatent",
+    "LossPolicy",
     "OnlineTaskLatent",
     "PLASPolicy",
     "PathTaskLatent",

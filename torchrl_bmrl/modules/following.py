@@ -1,4 +1,4 @@
-"""How a policy takes over what a loss has trained: as it is now, or as it is at each call."""
+"""Policies that act with the networks of a loss: with its own parameters, or with a copy."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from functools import wraps
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 from weakref import WeakSet
 
 import torch
@@ -22,15 +22,16 @@ if TYPE_CHECKING:
     from torchrl.objectives import LossModule
 
 Self = TypeVar("Self", bound="LossPolicy")
+Made: TypeAlias = "tuple[Self, Sequence[Link | None], Sequence[str]]"
 
 
 def dispatched(forward: Callable[..., Any]) -> Callable[..., Any]:
     """A policy's ``forward`` that also takes tensors, by keyword or in the order of ``in_keys``.
 
-    It does what tensordict's ``dispatch`` does, and knows which dimensions are rows: where a
-    network says the size of an entry, all but the last one; of another, such as a picture, the
-    first.
-    The signature names the usual keys, since ``torch.export`` takes dynamic shapes for names alone.
+    It does the same as tensordict's ``dispatch``, but finds the batch dimensions: where a network
+    declares the size of an entry, all dimensions but the last; for other entries, such as pictures,
+    the first. The signature contains the usual keys because ``torch.export`` needs names for
+    dynamic shapes.
     """
 
     @wraps(forward)
@@ -60,32 +61,84 @@ def dispatched(forward: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class LossPolicy(TensorDictModuleBase):
-    """What the policies share: where their networks come from, and calls with keywords."""
+    """Base of the policies that act with the networks of a loss.
+
+    A subclass defines ``_from``, which makes the policy of a loss, its links to the loss's networks
+    and the names of the loss's coefficients that it reads.
+
+    Example:
+        >>> from torchrl_bmrl.modules import ActionVAE, BCQPolicy, make_qvalue_network
+        >>> from torchrl_bmrl.objectives import BCQLoss
+        >>> loss = BCQLoss(ActionVAE(3, 2), make_qvalue_network(3, 2), bounds=(-1.0, 1.0))
+        >>> live, frozen = BCQPolicy.live(loss), BCQPolicy.frozen(loss, num_candidates=10)
+        >>> live(observation=torch.zeros(5, 3)).shape
+        torch.Size([5, 2])
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.__dict__["_source"] = None
 
-    def _follows(self: Self, loss: Any, links: Sequence[Link], numbers: Mapping[str, str]) -> Self:
-        """Makes the policy act with a loss's own parameters, whatever becomes of them.
+    @classmethod
+    def live(cls: type[Self], loss: LossModule, **options: Any) -> Self:
+        """The policy that a loss trains, for hooks, collectors and evaluation during training.
+
+        It shares the loss's parameters, so ``update_policy_weights_()`` of a collector sends the
+        present ones. A copy of it, as in a worker's process, is independent.
 
         Args:
-            loss: that is followed.
-            links: the policy's networks and where the loss keeps their parameters.
-            numbers: names of the policy's numbers, and of the loss's coefficients.
+            loss: a loss of the policy's algorithm. A ``BCQPolicy`` also takes other losses with a
+                generator and critics; of a
+                :class:`~torchrl_bmrl.objectives.MetaDistillationLoss` the student acts, which reads
+                ``task_latent``.
+            **options: of the policy, such as ``num_candidates``.
+
+        Raises:
+            BMRLError: for a loss without the networks of the policy, or a stack of losses.
+        """
+        policy, links, numbers = cls._from(loss, True, **options)
+        return policy._follows(loss, links, numbers)
+
+    @classmethod
+    def frozen(cls: type[Self], loss: LossModule, **options: Any) -> Self:
+        """A policy with a copy of the loss's parameters; later updates do not reach it.
+
+        Args:
+            loss: as for :meth:`live`.
+            **options: of the policy, such as ``num_candidates``.
+
+        Raises:
+            BMRLError: for a loss without the networks of the policy, or a stack of losses.
+        """
+        return cls._from(loss, False, **options)[0]
+
+    @classmethod
+    def _from(cls: type[Self], loss: Any, live: bool, **options: Any) -> Made[Self]:
+        raise NotImplementedError(f"{cls.__name__} has no _from(); valid: a method that makes it")
+
+    def _follows(
+        self: Self, loss: Any, links: Sequence[Link | None], numbers: Sequence[str]
+    ) -> Self:
+        """Makes the policy act with a loss's own parameters, even after they are replaced.
+
+        Args:
+            loss: the loss.
+            links: the policy's networks and their parameters in the loss.
+            numbers: names of the loss's coefficients that the policy has, too.
         """
         # Outside _modules: the loss's parameters are not the policy's.
-        self.__dict__["_source"] = (loss, list(links), dict(numbers))
-        # The loss tells when its parameters lie elsewhere: what reads them may not call the policy.
+        used = [link for link in links if link is not None]
+        self.__dict__["_source"] = (loss, used, numbers)
+        # The loss calls follow() when its parameters are replaced.
         loss.__dict__.setdefault("_followers", WeakSet()).add(self)
         self.follow()
         return self
 
     def follow(self) -> None:
-        """Takes over the present parameters of the loss that a live policy follows.
+        """Updates a live policy to the present parameters of its loss.
 
-        Every call of the policy does it, and the loss when it moves to another device or type, or
-        when parameters or coefficients are replaced. For a frozen policy nothing happens.
+        Every call of the policy does this, and so does the loss when it moves to another device or
+        dtype, or when parameters or coefficients are replaced. A frozen policy does not change.
         """
         source = self.__dict__.get("_source")
         if source is None or torch.compiler.is_compiling():
@@ -94,11 +147,11 @@ class LossPolicy(TensorDictModuleBase):
         for link in links:
             for own, now in zip(link.own, link.leaves(loss), strict=True):
                 own.data = now.detach()  # the same memory, not a copy
-        for name, coefficient in numbers.items():
-            setattr(self, name, getattr(loss, coefficient))
+        for name in numbers:
+            setattr(self, name, getattr(loss, name))
 
     def rows_of(self, entries: Mapping[NestedKey, Tensor]) -> TensorDict:
-        """The entries of a call with tensors, with the batch size that they have in common.
+        """The entries of a call with tensors, with their common batch size.
 
         Args:
             entries: tensors by key.
@@ -117,18 +170,18 @@ class LossPolicy(TensorDictModuleBase):
         return result
 
     def __getstate__(self) -> dict[str, Any]:
-        # A copy, or what a worker is sent, stands alone; its weights can be updated.
+        # A copy, such as a worker's, does not follow the loss; its weights can be updated.
         self.follow()
         return self.__dict__ | {"_source": None}
 
 
 class Link:
-    """A policy's network and where a loss keeps its parameters.
+    """A policy's network and its parameters in a loss.
 
     Args:
         module: the policy's own network.
         name: of the loss's network.
-        critic: which of the loss's critics it is.
+        critic: index of the loss's critic; ``None`` for another network.
     """
 
     def __init__(self, module: Any, name: str, critic: int | None) -> None:
@@ -154,7 +207,7 @@ def _held(loss: Any, name: str, critic: int | None) -> tuple[Any, TensorDictBase
 def link(
     loss: Any, name: str, live: bool, *, critic: int | None = None, optional: bool = False
 ) -> Any:
-    """A stand-alone network with a loss's parameters, or a copy of them."""
+    """An independent network with a loss's parameters, or with a copy of them."""
     if hasattr(loss, "member"):
         raise BMRLError(
             f"a {type(loss).__name__} has {len(loss)} policies; valid: a policy of one member, "
@@ -183,12 +236,12 @@ def as_number(value: Any) -> Any:
 
 
 def key_options(loss: LossModule, *names: str) -> dict[str, NestedKey]:
-    """Arguments that carry a loss's names of keys over to its policy."""
+    """Arguments that give a policy the loss's names of keys."""
     return {f"{name}_key": getattr(loss.tensor_keys, name) for name in names}
 
 
 def extract_network(loss: LossModule, name: str) -> Any:
-    """A stand-alone, frozen copy of one of a loss's networks; ``None`` for one it does not have.
+    """An independent, frozen copy of one of a loss's networks; ``None`` if it is ``None``.
 
     Args:
         loss: such as :class:`~torchrl_bmrl.objectives.PLASLoss`.
@@ -206,11 +259,11 @@ def extract_network(loss: LossModule, name: str) -> Any:
 
 
 def extract_critic(loss: LossModule, index: int = 0) -> TensorDictModule:
-    """A stand-alone, frozen copy of one of a loss's critics.
+    """An independent, frozen copy of one of a loss's critics.
 
     Args:
         loss: such as :class:`~torchrl_bmrl.objectives.BCQLoss`.
-        index: of the critic; policies act by the first, 0.
+        index: of the critic; policies act with the first, 0.
 
     Example:
         >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
@@ -225,9 +278,9 @@ def extract_critic(loss: LossModule, index: int = 0) -> TensorDictModule:
 def _instantiate(
     module: TensorDictModule, params: TensorDictBase, live: bool = False
 ) -> TensorDictModule:
-    """A stand-alone module with the given parameters, in their own memory if it is live."""
+    """An independent module with the given parameters; it shares their memory if it is live."""
     module = deepcopy(module)
-    # As parameters: plain tensors would act, but be missing from parameters() and state_dict().
+    # As parameters: parameters() and state_dict() would not contain plain tensors.
     own = TensorDictParams(params.data if live else params.data.clone())
     own.to_module(module, preserve_module_state=False)
     return module.requires_grad_(False)

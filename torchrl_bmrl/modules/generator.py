@@ -1,4 +1,4 @@
-"""The conditional variational autoencoder that proposes actions."""
+"""Networks of the losses: the autoencoder that proposes actions, critics, and actors."""
 
 from __future__ import annotations
 
@@ -10,69 +10,37 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torch.nn.functional import linear
 from torchrl.modules import MLP
 
 from torchrl_bmrl.generators import Autoencoder
 
 
-class CandidateMLP(MLP):
-    """TorchRL's MLP, which of an input that is the same for all candidates takes one.
-
-    Such an input is expanded along the dimension before the last one (its stride there is 0), as a
-    state is over the actions proposed for it: its part of the first layer is computed once and
-    added to each candidate's own.
-
-    Example:
-        >>> network = CandidateMLP(3, 2, num_cells=[8])
-        >>> state, actions = torch.randn(5, 1, 1).expand(5, 10, 1), torch.randn(5, 10, 2)
-        >>> whole = network(state.contiguous(), actions)
-        >>> torch.allclose(network(state, actions), whole, atol=1e-6)
-        True
-    """
+class RowsMLP(MLP):
+    """TorchRL's MLP, whose layers see all batch dimensions as one."""
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Output for the inputs, concatenated along the last dimension."""
-        first, *rest = self
-        alike = [x.ndim > 1 and x.shape[-2] > 1 and x.stride(-2) == 0 for x in inputs]
-        if any(alike) and not all(alike):
-            weights = first.weight.split([x.shape[-1] for x in inputs], -1)
-            parts = list(zip(inputs, weights, alike, strict=True))
-            once = [(x[..., :1, :], weight) for x, weight, same in parts if same]
-            each = [(x, weight) for x, weight, same in parts if not same]
-            hidden = _linear(each) + _linear(once, first.bias)
-            shape = hidden.shape[:-1]
-            hidden = hidden.reshape(-1, hidden.shape[-1])
-        else:
-            whole = torch.cat(inputs, -1) if len(inputs) > 1 else inputs[0]
-            shape = whole.shape[:-1]
-            # In rows: else the layer's output is a view, and to change a view in place, as ReLU
-            # does here, costs several copies in the gradient.
-            hidden = first(whole.reshape(-1, whole.shape[-1]))
-        for layer in rest:
+        hidden = torch.cat(inputs, -1) if len(inputs) > 1 else inputs[0]
+        shape = hidden.shape[:-1]
+        # With more dimensions a layer's output is a view, and to change a view in place, as ReLU
+        # does here, costs several copies in the backward pass.
+        hidden = hidden.reshape(-1, hidden.shape[-1])
+        for layer in self:
             hidden = layer(hidden)
         return hidden.reshape(*shape, hidden.shape[-1])
 
 
-def _linear(parts: Sequence[tuple[Tensor, Tensor]], bias: Tensor | None = None) -> Tensor:
-    """Linear layer of inputs, each with its columns of the weights."""
-    inputs, weights = zip(*parts, strict=True)
-    if len(parts) == 1:
-        return linear(inputs[0], weights[0], bias)
-    return linear(torch.cat(inputs, -1), torch.cat(weights, -1), bias)
-
-
 class Network(TensorDictModule):
-    """TensorDictModule that says its sizes, and whose tensors are written as they are.
+    """TensorDictModule that declares its sizes, and writes its outputs without extra checks.
 
-    tensordict 0.14 looks on the disk for pandas at each output that it writes, a tenth of a small
-    update.
+    tensordict 0.14 searches the disk for pandas at each output that it writes, which takes a tenth
+    of a small update.
 
     Args:
-        module: what computes.
+        module: the network.
         in_keys: keys that it reads.
         out_keys: keys that it writes.
-        sizes: of the entries, which losses compare between networks.
+        sizes: of the entries; losses compare them between networks.
         **options: of TensorDictModule.
 
     Example:
@@ -95,7 +63,7 @@ class Network(TensorDictModule):
 
     @property
     def bounds(self) -> tuple[Tensor, Tensor] | None:
-        """Bounds of what it writes, ``None`` where it has none."""
+        """Bounds of its output, ``None`` where it has none."""
         module = self.module
         return (module.low, module.high) if isinstance(module, _BoundedDecoder) else None
 
@@ -119,7 +87,7 @@ class Network(TensorDictModule):
 def _sized(
     module: nn.Module, reads: Mapping[NestedKey, int], writes: Mapping[NestedKey, int]
 ) -> Network:
-    """A network of entries whose sizes are known."""
+    """A network for entries of known sizes."""
     return Network(module, list(reads), list(writes), {**reads, **writes})
 
 
@@ -130,7 +98,7 @@ def make_mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> M
         >>> make_mlp(3, 2, (8,))(torch.zeros(5, 1), torch.zeros(5, 2)).shape
         torch.Size([5, 2])
     """
-    return CandidateMLP(
+    return RowsMLP(
         in_features,
         out_features,
         num_cells=list(num_cells),
@@ -140,7 +108,7 @@ def make_mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> M
 
 
 class _Posterior(nn.Module):
-    """Mean and standard deviation of the latent, log-deviation clamped as published."""
+    """Mean and standard deviation of the latent, with the published clamp of the latter's log."""
 
     def __init__(self, in_features: int, latent_dim: int, num_cells: Sequence[int]) -> None:
         super().__init__()
@@ -251,17 +219,17 @@ def make_decoder(
 ) -> TensorDictModule:
     """Decoder from observation, ``action_latent`` and, with ``task_latent_dim``, ``task_latent``.
 
-    The student of the distillation is such a decoder alone: it needs no encoder.
+    The student of the distillation is such a decoder; it needs no encoder.
 
     Args:
         observation_dim: size of the observation.
         action_dim: size of the action.
         latent_dim: size of ``action_latent``.
-        task_latent_dim: size of ``task_latent``; 0 for a decoder that does not read it.
+        task_latent_dim: size of ``task_latent``; 0 for a decoder without this input.
         num_cells: widths of the hidden layers.
         bounds: lower and upper bound of the action, numbers or ``(action_dim,)``; the output is
             squashed between them.
-        in_keys: names of what is read, in the order above; ``None`` for those above.
+        in_keys: names of the inputs, in the order above; ``None`` for those above.
 
     Returns:
         a module that writes ``action (*B, action_dim)``.
@@ -292,7 +260,7 @@ def make_qvalue_network(
     Args:
         observation_dim: size of the observation.
         action_dim: size of the action.
-        task_latent_dim: size of ``task_latent``; 0 for a critic that does not read it.
+        task_latent_dim: size of ``task_latent``; 0 for a critic without this input.
         num_cells: widths of the hidden layers.
 
     Example:

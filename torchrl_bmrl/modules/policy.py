@@ -1,26 +1,32 @@
-"""Acting with a generator and a critic."""
+"""Policies of BCQ and PLAS."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torch.nn.functional import one_hot
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.functional import likely_actions, perturbed_action
-from torchrl_bmrl.generators import ActionKeys, decode_draws
-from torchrl_bmrl.modules.following import LossPolicy, as_number, dispatched, key_options, link
+from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.functional import perturbed_action
+from torchrl_bmrl.generators import ActionKeys, check_bounds, decode_draws
+from torchrl_bmrl.modules.following import (
+    LossPolicy,
+    Made,
+    as_number,
+    dispatched,
+    key_options,
+    link,
+)
 from torchrl_bmrl.ownership import check_trained
 
-if TYPE_CHECKING:
-    from torchrl.objectives import LossModule
+PERTURBATION = ("max_perturbation", "action_low", "action_high")
+"""Coefficients and buffers of a loss that a perturbation needs."""
 
 
 class BCQPolicy(LossPolicy):
@@ -32,9 +38,10 @@ class BCQPolicy(LossPolicy):
     with :math:`h` half the action's range. Reference: *Compositional Skill Learning Using Batch
     Meta RL*, eq. 2, section 7.1.
 
-    It serves stage 1 and stage 2 alike: where the generator and the critic read ``task_latent``, so
-    does the policy. Proposals are drawn from PyTorch's global generator at every call, whatever the
-    exploration type. A trained loss acts through :meth:`live` or :meth:`frozen`.
+    It is used in stage 1 and stage 2: if the generator and the critic read ``task_latent``, so does
+    the policy. Proposals are drawn from PyTorch's global generator at every call, whatever the
+    exploration type is. :meth:`~LossPolicy.live` and :meth:`~LossPolicy.frozen` make the policy of
+    a loss.
 
     Args:
         generator: a generator as :mod:`torchrl_bmrl.generators` describes it, or a decoder
@@ -43,17 +50,17 @@ class BCQPolicy(LossPolicy):
         perturbation_network: optional (observation, ``action``) → ``perturbation``.
 
     Keyword Args:
-        latent_dim: size of ``action_latent``; needed for a decoder that does not say it.
-        num_candidates: proposals per state. Default 100.
-        latent_clip: bound on the latent, ``None`` for none. Default 0.5.
+        latent_dim: size of ``action_latent``; needed for a decoder that does not declare it.
+        num_candidates: proposals per state.
+        latent_clip: bound on the latent, ``None`` for none.
         max_perturbation: φ.
-        bounds: of the action, read with a perturbation network alone; by default the generator's.
-        action_key, action_latent_key, perturbation_key, state_action_value_key: what the networks
-            call them.
+        bounds: of the action, needed for a perturbation network; by default the generator's.
+        action_key, action_latent_key, perturbation_key, state_action_value_key: names of these
+            entries in the networks.
 
     Keys read: what the networks read beside what they write, such as ``observation (*B, obs_dim)``
-    and ``task_latent (*B, m)``. Key written: ``action (*B, action_dim)``. Keywords serve, too:
-    ``policy(observation=observation)`` returns the action.
+    and ``task_latent (*B, m)``. Key written: ``action (*B, action_dim)``. A call with keywords,
+    ``policy(observation=observation)``, returns the action.
 
     Raises:
         BMRLError: for candidates below one, a latent size or bounds that are not the generator's or
@@ -110,38 +117,7 @@ class BCQPolicy(LossPolicy):
         self.out_keys = [action_key]
 
     @classmethod
-    def live(cls, loss: LossModule, *, num_candidates: int = 100) -> BCQPolicy:
-        """The policy that a loss trains, as it is at each call: for hooks, collectors, evaluation.
-
-        It holds the loss's parameters, not copies, so ``update_policy_weights_()`` of a collector
-        sends what the loss has learnt. A copy of it, as in a worker's process, stands alone.
-
-        Args:
-            loss: a :class:`~torchrl_bmrl.objectives.BCQLoss`, or another loss with a generator and
-                critics; of a :class:`~torchrl_bmrl.objectives.MetaDistillationLoss` the student
-                acts, which reads ``task_latent``.
-            num_candidates: proposals per state.
-
-        Raises:
-            BMRLError: for a loss without a generator or critics, or a stack of losses.
-        """
-        return cls._of(loss, num_candidates, live=True)
-
-    @classmethod
-    def frozen(cls, loss: LossModule, *, num_candidates: int = 100) -> BCQPolicy:
-        """A copy of the policy that a loss has trained; later updates do not reach it.
-
-        Args:
-            loss: as for :meth:`live`.
-            num_candidates: proposals per state.
-
-        Raises:
-            BMRLError: for a loss without a generator or critics, or a stack of losses.
-        """
-        return cls._of(loss, num_candidates, live=False)
-
-    @classmethod
-    def _of(cls, loss: Any, num_candidates: int, *, live: bool) -> BCQPolicy:
+    def _from(cls, loss: Any, live: bool, **options: Any) -> Made[BCQPolicy]:
         if hasattr(loss, "actor_network"):
             raise BMRLError(
                 f"{type(loss).__name__} acts by its actor_network, not by the best of many "
@@ -162,19 +138,14 @@ class BCQPolicy(LossPolicy):
             critic.module,
             None if perturbation is None else perturbation.module,
             latent_dim=latent_dim,
-            num_candidates=num_candidates,
             latent_clip=as_number(loss.latent_clip),
             bounds=bounds,
             max_perturbation=0.0 if student else as_number(loss.max_perturbation),
             **key_options(loss, *names, *(["perturbation"] if not student else [])),
+            **options,
         )
-        if not live:
-            return policy
-        links = [link for link in (generator, critic, perturbation) if link is not None]
-        numbers = {"latent_clip": "latent_clip"}
-        if not student:
-            numbers |= {name: name for name in ("max_perturbation", "action_low", "action_high")}
-        return policy._follows(loss, links, numbers)
+        numbers = ("latent_clip",) if student else ("latent_clip", *PERTURBATION)
+        return policy, (generator, critic, perturbation), numbers
 
     @dispatched
     @torch.no_grad()
@@ -185,18 +156,20 @@ class BCQPolicy(LossPolicy):
         return tensordict.set(self.keys.action, self.choose(proposals))
 
     def choose(self, proposals: TensorDictBase) -> Tensor:
-        """The most valuable of proposed actions, perturbed as the policy perturbs them.
+        """The most valuable of proposed actions, after the policy's perturbation.
 
         Args:
             proposals: batch ``[*B, N]`` with the state and the action, as :meth:`propose` returns
-                them; N is free.
+                them, with any N.
 
         Returns:
             the action, ``(*B, action_dim)``.
         """
         proposals = _perturb(self, proposals)
         rows = proposals
-        if self._flat_rows:  # a BatchNorm takes the second of more than two dimensions for features
+        if (
+            self._flat_rows
+        ):  # with more than two dimensions a BatchNorm takes the second for its features
             rows = proposals.reshape(-1)
         value = self.qvalue_network(rows).get(self.state_action_value_key)
         value = value.reshape(*proposals.batch_size, 1)
@@ -228,7 +201,8 @@ class PLASPolicy(LossPolicy):
     .. math:: \mu(s) = a + \phi\, h\, \xi(s, a),\quad a = G(s, \pi(s))
 
     with :math:`h` half the action's range. Reference: Zhou et al. 2020,
-    https://arxiv.org/abs/2011.07213. A trained loss acts through :meth:`live` or :meth:`frozen`.
+    https://arxiv.org/abs/2011.07213. :meth:`~LossPolicy.live` and :meth:`~LossPolicy.frozen` make
+    the policy of a loss.
 
     Args:
         actor_network: (observation) → ``action_latent``.
@@ -237,11 +211,11 @@ class PLASPolicy(LossPolicy):
 
     Keyword Args:
         max_perturbation: φ.
-        bounds: of the action, read with a perturbation network alone; by default the decoder's.
-        action_key, action_latent_key, perturbation_key: what the networks call them.
+        bounds: of the action, needed for a perturbation network; by default the decoder's.
+        action_key, action_latent_key, perturbation_key: names of these entries in the networks.
 
     Keys read: what the networks read beside what they write, such as ``observation (*B, obs_dim)``.
-    Key written: ``action (*B, action_dim)``. Keywords serve, too.
+    Key written: ``action (*B, action_dim)``. A call with keywords returns the action.
 
     Raises:
         BMRLError: for bounds that are not the decoder's, or missing.
@@ -282,31 +256,7 @@ class PLASPolicy(LossPolicy):
         self.out_keys = [action_key]
 
     @classmethod
-    def live(cls, loss: LossModule) -> PLASPolicy:
-        """The policy that a loss trains, as it is at each call; see :meth:`BCQPolicy.live`.
-
-        Args:
-            loss: a :class:`~torchrl_bmrl.objectives.PLASLoss`.
-
-        Raises:
-            BMRLError: for another loss.
-        """
-        return cls._of(loss, live=True)
-
-    @classmethod
-    def frozen(cls, loss: LossModule) -> PLASPolicy:
-        """A copy of the policy that a loss has trained; later updates do not reach it.
-
-        Args:
-            loss: a :class:`~torchrl_bmrl.objectives.PLASLoss`.
-
-        Raises:
-            BMRLError: for another loss.
-        """
-        return cls._of(loss, live=False)
-
-    @classmethod
-    def _of(cls, loss: Any, *, live: bool) -> PLASPolicy:
+    def _from(cls, loss: Any, live: bool, **options: Any) -> Made[PLASPolicy]:
         generator, actor = (link(loss, name, live) for name in ("generator", "actor_network"))
         if loss.tensor_keys.action_latent not in actor.module.out_keys:
             raise BMRLError(
@@ -321,12 +271,9 @@ class PLASPolicy(LossPolicy):
             max_perturbation=as_number(loss.max_perturbation),
             bounds=(loss.action_low, loss.action_high),
             **key_options(loss, "action", "action_latent", "perturbation"),
+            **options,
         )
-        if not live:
-            return policy
-        links = [link for link in (generator, actor, perturbation) if link is not None]
-        names = ("max_perturbation", "action_low", "action_high")
-        return policy._follows(loss, links, {name: name for name in names})
+        return policy, (generator, actor, perturbation), PERTURBATION
 
     @dispatched
     @torch.no_grad()
@@ -337,160 +284,37 @@ class PLASPolicy(LossPolicy):
         return tensordict.set(self.keys.action, data.get(self.keys.action))
 
 
-class DiscreteBCQPolicy(LossPolicy):
-    r"""The most valuable of the actions that are likely enough.
-
-    .. math:: \pi(s) = \arg\max_a \{Q_1(s, a) : G(a|s) / \max_{a'} G(a'|s) > \tau\}
-
-    Reference: Fujimoto et al. 2019, https://arxiv.org/abs/1910.01708. A trained loss acts through
-    :meth:`live` or :meth:`frozen`.
-
-    Args:
-        generator: classifier of the data's actions (observation) → ``logits``.
-        qvalue_network: (observation) → ``action_value``.
-
-    Keyword Args:
-        threshold: τ. Default 0.3.
-        action_space: ``"one-hot"``, written as ``(*B, n)``, or ``"categorical"``, ``(*B,)``.
-        action_key, logits_key, action_value_key: what the networks call them.
-
-    Keys read: ``observation``. Key written: ``action``, int64. Keywords serve, too.
-
-    Raises:
-        BMRLError: for another action space, a critic that a loss has copied and trains elsewhere,
-            or at a call for networks of different numbers of actions.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> from torchrl.modules import MLP
-        >>> generator, critic = (
-        ...     TensorDictModule(MLP(3, 4), in_keys=["observation"], out_keys=[key])
-        ...     for key in ("logits", "action_value")
-        ... )
-        >>> policy = DiscreteBCQPolicy(generator, critic)
-        >>> policy(TensorDict({"observation": torch.zeros(5, 3)}, [5]))["action"].sum(-1)
-        tensor([1, 1, 1, 1, 1])
-    """
-
-    def __init__(
-        self,
-        generator: TensorDictModule,
-        qvalue_network: TensorDictModule,
-        *,
-        threshold: float = 0.3,
-        action_space: str = "one-hot",
-        action_key: NestedKey = "action",
-        logits_key: NestedKey = "logits",
-        action_value_key: NestedKey = "action_value",
-    ) -> None:
-        super().__init__()
-        check_trained("qvalue_network", qvalue_network)
-        action_space = str(action_space).replace("_", "-")
-        if action_space not in ("one-hot", "categorical"):
-            raise UnknownNameError("action_space", action_space, ("one-hot", "categorical"))
-        self.logits_key = logits_key
-        self.action_value_key = action_value_key
-        self.generator = generator
-        self.qvalue_network = qvalue_network
-        self.threshold = threshold
-        self.action_space = action_space
-        self.in_keys = list(dict.fromkeys([*generator.in_keys, *qvalue_network.in_keys]))
-        self.out_keys = [action_key]
-
-    @classmethod
-    def live(cls, loss: LossModule) -> DiscreteBCQPolicy:
-        """The policy that a loss trains, as it is at each call; see :meth:`BCQPolicy.live`.
-
-        Args:
-            loss: a :class:`~torchrl_bmrl.objectives.DiscreteBCQLoss`.
-
-        Raises:
-            BMRLError: for another loss.
-        """
-        return cls._of(loss, live=True)
-
-    @classmethod
-    def frozen(cls, loss: LossModule) -> DiscreteBCQPolicy:
-        """A copy of the policy that a loss has trained; later updates do not reach it.
-
-        Args:
-            loss: a :class:`~torchrl_bmrl.objectives.DiscreteBCQLoss`.
-
-        Raises:
-            BMRLError: for another loss.
-        """
-        return cls._of(loss, live=False)
-
-    @classmethod
-    def _of(cls, loss: Any, *, live: bool) -> DiscreteBCQPolicy:
-        links = [link(loss, "generator", live), link(loss, "qvalue_network", live, critic=0)]
-        policy = cls(
-            *(link.module for link in links),
-            threshold=as_number(loss.threshold),
-            action_space=loss.action_space,
-            **key_options(loss, "action", "logits", "action_value"),
-        )
-        return policy._follows(loss, links, {"threshold": "threshold"}) if live else policy
-
-    @dispatched
-    @torch.no_grad()
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes ``action``.
-
-        Raises:
-            BMRLError: if generator and critic know different numbers of actions.
-        """
-        self.follow()
-        data = self.qvalue_network(self.generator(tensordict.select(*self.in_keys)))
-        logits, value = data.get(self.logits_key), data.get(self.action_value_key)
-        if logits.shape != value.shape:
-            raise BMRLError(
-                f"{self.logits_key!r} has the shape {tuple(logits.shape)} and "
-                f"{self.action_value_key!r} {tuple(value.shape)}; valid: equal shapes"
-            )
-        value = value.masked_fill(~likely_actions(logits, self.threshold), -torch.inf)
-        action = value.argmax(-1)
-        if self.action_space == "one-hot":
-            action = one_hot(action, value.shape[-1])
-        return tensordict.set(self.out_keys[0], action)
-
-
-# -- what the policies check -----------------------------------------------------------------------
+# -- helpers ---------------------------------------------------------------------------------------
 
 
 def _latent_dim(generator: Any, given: int | None, key: NestedKey) -> Any:
-    """Size of the latent, which generator and argument must agree on; ``None`` without one."""
-    said = getattr(generator, "latent_dim", (getattr(generator, "sizes", None) or {}).get(key))
-    if given is None and said is None and not hasattr(generator, "propose"):
+    """Size of the latent, from the generator or the argument; ``None`` without a latent."""
+    own = getattr(generator, "latent_dim", (getattr(generator, "sizes", None) or {}).get(key))
+    if given is None and own is None and not hasattr(generator, "propose"):
         raise BMRLError(
-            "latent_dim is None and the decoder does not say it; valid: the size of "
-            f"{key!r}, which it reads"
+            f"latent_dim is None and the decoder does not declare it; valid: the size of {key!r}, "
+            "which it reads"
         )
-    if None not in (given, said) and given != said:
-        raise BMRLError(f"latent_dim is {given}; valid: {said}, the generator's")
-    return said if given is None else given
+    if None not in (given, own) and given != own:
+        raise BMRLError(f"latent_dim is {given}; valid: {own}, the generator's")
+    return own if given is None else given
 
 
 def _register_bounds(policy: Any, generator: Any, perturbation: Any, given: Any) -> None:
-    """Bounds of the action, which generator and argument must agree on."""
-    said = getattr(generator, "bounds", None)
-    if given is None and said is None and perturbation is not None:
+    """Registers the bounds of the action, from the generator or the argument."""
+    own = getattr(generator, "bounds", None)
+    if given is None and own is None and perturbation is not None:
         raise BMRLError("bounds are None; valid: (low, high) of the action, to perturb it within")
-    bounds = given if given is not None else said if said is not None else (-1.0, 1.0)
-    for name, bound, own in zip(("low", "high"), bounds, said or bounds, strict=True):
+    bounds = next(x for x in (given, own, (-1.0, 1.0)) if x is not None)
+    check_bounds(bounds, generator)
+    for name, bound in zip(("low", "high"), bounds, strict=True):
         bound = torch.as_tensor(bound)
         bound = bound if bound.is_floating_point() else bound.to(torch.get_default_dtype())
-        own = torch.as_tensor(own).to(bound)
-        one, other = torch.broadcast_tensors(bound, own)
-        if not torch.allclose(one, other):
-            raise BMRLError(
-                f"bounds say {name} {bound.tolist()}; valid: {own.tolist()}, the generator's"
-            )
         policy.register_buffer(f"action_{name}", bound.detach().clone())
 
 
 def _perturb(policy: BCQPolicy | PLASPolicy, data: TensorDictBase) -> TensorDictBase:
-    """Moves the action by the policy's perturbation network, if it has one."""
+    """Adds the output of the policy's perturbation network to the action, if there is one."""
     network, key = policy.perturbation_network, policy.keys.action
     if network is None:
         return data
@@ -501,6 +325,6 @@ def _perturb(policy: BCQPolicy | PLASPolicy, data: TensorDictBase) -> TensorDict
 
 
 def _state_keys(networks: Iterable[TensorDictModule | None], made: Iterable[Any]) -> list[Any]:
-    """What networks read beside what they make for each other."""
+    """Keys that networks read, without those that they write for each other."""
     keys = [key for network in networks if network is not None for key in network.in_keys]
     return [key for key in dict.fromkeys(keys) if key not in set(made)]

@@ -1,4 +1,4 @@
-"""The part of TorchRL's contract that does not depend on what a loss learns."""
+"""The part of a loss that does not depend on what it learns: keys, coefficients, reduction."""
 
 from __future__ import annotations
 
@@ -6,29 +6,34 @@ from collections.abc import Iterable
 from copy import deepcopy
 from dataclasses import asdict
 from math import inf
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
-from tensordict import TensorDictBase, TensorDictParams, unravel_key
+from tensordict import TensorDict, TensorDictBase, TensorDictParams, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.objectives.checks import check_number, entry, parts_of
+from torchrl_bmrl.functional import unpadded
+from torchrl_bmrl.objectives.checks import check_number, whole_signature
+from torchrl_bmrl.objectives.data import entry
+from torchrl_bmrl.objectives.sizes import agreed_sizes, check_fit, is_lazy, parts_of
+from torchrl_bmrl.objectives.swap import Weights, holding, leaves, read, without_gradient
 
 REDUCTIONS = ("mean", "sum", "none")
 
 
 class KeyedLoss(LossModule):
-    """Base of all losses here: keys that are read and written, coefficients, and the reduction.
+    """Base of all losses: keys, coefficients, calls of the networks, and the reduction.
 
-    A subclass says what it reads and writes (:meth:`read_keys`, :meth:`written_keys`) and ends its
-    construction with :meth:`keep_keys`.
+    A subclass lists the keys that it reads and writes (:meth:`read_keys`, :meth:`written_keys`)
+    and calls :meth:`keep_keys` at the end of its ``__init__``. Where its ``__init__`` takes
+    ``**options`` for its base, ``inspect.signature`` of the class shows the base's options, too.
 
     Keyword Args:
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``; ``None`` is ``"mean"``.
-        deactivate_vmap: run ensembles in a loop and not under :func:`torch.vmap`.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``; ``None`` means ``"mean"``.
+        deactivate_vmap: run ensembles in a loop instead of under :func:`torch.vmap`.
         use_prioritized_weights: ``True``, ``False`` or ``"auto"``, as in TorchRL's losses.
 
     Raises:
@@ -41,15 +46,24 @@ class KeyedLoss(LossModule):
         >>> loss.set_keys(reward="points")
         >>> ("next", "points") in loss.in_keys, loss.out_keys[:2]
         (True, ['loss_generator', 'loss_qvalue'])
-        >>> loss.lmbda = 0.5  # as a scheduler does it; a buffer, so that it is saved
+        >>> loss.lmbda = 0.5  # as a scheduler does; coefficients are buffers, so they are saved
         >>> loss.lmbda
         tensor(0.5000)
     """
 
+    fixed_options: ClassVar[tuple[str, ...]] = ()
+    """Options of the base that a subclass sets itself and does not accept."""
+    separate_losses = False
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "__init__" in vars(cls):
+            cls.__signature__ = whole_signature(cls, cls.fixed_options)
+
     def __init__(
         self,
         *,
-        reduction: str | None = None,
+        reduction: str | None = "mean",
         deactivate_vmap: bool = False,
         use_prioritized_weights: str | bool = "auto",
     ) -> None:
@@ -58,9 +72,11 @@ class KeyedLoss(LossModule):
         if reduction not in REDUCTIONS:
             raise UnknownNameError("reduction", reduction, REDUCTIONS)
         self._coefficients: dict[str, tuple[float, float, bool]] = {}
+        self._shared_with_generator: dict[str, list[NestedKey]] = {}
         self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[str] | None = None
         self._left_behind: str | None = None
+        self._cold = False  # whether a network is lazy
         self.reduction = reduction
         self.deactivate_vmap = deactivate_vmap
         self.use_prioritized_weights = use_prioritized_weights
@@ -70,9 +86,9 @@ class KeyedLoss(LossModule):
     def register_coefficients(
         self, *, low: float = 0.0, high: float = inf, optional: bool = False, **values: Any
     ) -> None:
-        """Makes hyper-parameters buffers of the networks' type and device.
+        """Registers hyper-parameters as buffers with the networks' dtype and device.
 
-        A later assignment of a number, ``loss.lmbda = 0.5``, is checked and goes to the buffer.
+        A later assignment of a number, ``loss.lmbda = 0.5``, is checked and written to the buffer.
 
         Args:
             low: smallest valid value.
@@ -86,7 +102,7 @@ class KeyedLoss(LossModule):
         if next(self.parameters(), None) is None:
             raise BMRLError(
                 f"register_coefficients({', '.join(values)}) before the loss has a network; valid: "
-                "after convert_to_functional, whose parameters say the type and device"
+                "after convert_to_functional, whose parameters give the dtype and device"
             )
         for name, value in values.items():
             value = check_number(name, value, low, high, optional=optional)
@@ -100,7 +116,7 @@ class KeyedLoss(LossModule):
 
     def __setattr__(self, name: str, value: Any) -> None:
         limits = self.__dict__.get("_coefficients", {}).get(name)
-        # A tensor with a gradient, or of members under vmap, takes the buffer's place.
+        # A tensor with a gradient, or one per member under vmap, replaces the buffer.
         if limits is None or (
             isinstance(value, Tensor) and (value.requires_grad or value.numel() != 1)
         ):
@@ -122,10 +138,10 @@ class KeyedLoss(LossModule):
             self.register_coeff_buffer(name, value, **self._type_and_device)
         self._parameters_changed()
 
-    # -- those who hold the parameters -----------------------------------------------------------
+    # -- copies, and policies that share the parameters ------------------------------------------
 
     def _parameters_changed(self) -> None:
-        """Tells live policies that parameters lie elsewhere, or coefficients have come or gone."""
+        """Updates live policies when parameters are replaced or coefficients come or go."""
         for policy in self.__dict__.get("_followers", ()):
             policy.follow()
 
@@ -135,10 +151,21 @@ class KeyedLoss(LossModule):
         return result
 
     def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
-        """Loads a state as :class:`torch.nn.Module` does; live policies follow."""
+        """Loads a state as :class:`torch.nn.Module` does, and updates live policies."""
         result = super().load_state_dict(*args, **kwargs)
         self._parameters_changed()
         return result
+
+    def _reset_module_parameters(self, module_name: str, module: Any) -> None:
+        """Initialises a network anew, each critic on its own, and copies it to its target."""
+        params = getattr(self, f"{module_name}_params")
+        for own in params.unbind(0) if params.batch_size else [params]:
+            fresh = deepcopy(module)
+            fresh.reset_parameters_recursive()
+            own.data.update_(TensorDict.from_module(fresh).data)
+        target = self._modules.get(f"target_{module_name}_params")
+        if target is not None:
+            target.data.update_(params.data)
 
     def __getstate__(self) -> dict[str, Any]:
         # Policies follow this loss, not its copies.
@@ -148,7 +175,7 @@ class KeyedLoss(LossModule):
         copy = type(self).__new__(type(self))
         memo[id(self)] = copy
         copy.__dict__.update(deepcopy(self.__getstate__(), memo))
-        # TensorDictParams copies its parameters on its own, and so unties what two networks share.
+        # Each TensorDictParams copies its own parameters, which would separate shared ones.
         places: dict[int, list[tuple[str, NestedKey]]] = {}
         for name, params in self.named_children():
             if isinstance(params, TensorDictParams):
@@ -165,15 +192,15 @@ class KeyedLoss(LossModule):
     # -- keys ------------------------------------------------------------------------------------
 
     def keep_keys(self) -> None:
-        """Ends the construction: what would be found at the first call is found now.
+        """Ends the construction: computes the keys now instead of at the first call.
 
-        Found then, a compiled loss would compile a second time.
+        Otherwise a compiled loss would compile a second time.
         """
         self.set_vmap_randomness(self.vmap_randomness)
         self._in_keys, self._out_keys = self.in_keys, self.out_keys
 
     def _make_vmap(self) -> None:
-        """Nothing is cached that ``set_vmap_randomness`` would have to renew."""
+        """Does nothing: no vmapped function is cached that a new randomness would change."""
 
     def read_keys(self) -> Iterable[NestedKey]:
         """Keys that the loss reads, in a stable order; duplicates are dropped."""
@@ -202,7 +229,7 @@ class KeyedLoss(LossModule):
 
     @property
     def out_keys(self) -> list[str]:
-        """Keys of the output, in the order of keyword dispatch."""
+        """Keys of the output, in the order in which a keyword call returns them."""
         if self._out_keys is None:
             self._out_keys = self.written_keys()
         return self._out_keys
@@ -217,10 +244,10 @@ class KeyedLoss(LossModule):
             self._in_keys = self.in_keys
 
     def set_keys(self, **kwargs: Any) -> None:
-        """Renames entries; a network's own names stay, and are compared at the next call.
+        """Renames entries; the networks keep their own names, which the next call compares.
 
         Args:
-            **kwargs: names of ``tensor_keys``; ``None`` for the default.
+            **kwargs: new names of ``tensor_keys``; ``None`` for the default.
         """
         super().set_keys(**kwargs)
         self._left_behind = None
@@ -234,7 +261,7 @@ class KeyedLoss(LossModule):
                 )
 
     def check_names(self) -> None:
-        """Refuses a network that reads an entry under a name that the loss no longer uses.
+        """Checks that no network reads an entry under a name that ``set_keys`` has replaced.
 
         Raises:
             BMRLError: naming the network.
@@ -257,16 +284,73 @@ class KeyedLoss(LossModule):
             if any(key in getattr(part, "in_keys", ()) for part in parts_of(network))
         ]
 
+    # -- networks ---------------------------------------------------------------------------------
+
+    def check_sizes(self, name: str, network: Any) -> None:
+        """Compares a new network's sizes with those of the networks that the loss already has.
+
+        Args:
+            name: of the network, for the message.
+            network: the network.
+
+        Raises:
+            BMRLError: if they do not fit together.
+        """
+        others = [(key, x) for key, x in vars(self).items() if isinstance(x, nn.Module)]
+        check_fit(name, network, agreed_sizes([*others, (name, network)]))
+        self._cold = self._cold or is_lazy(network)
+
+    def weights(self, name: str, *, target: bool = False, frozen: bool = False) -> Weights:
+        """Parameters of a network, to be used inside :func:`.swap.holding`.
+
+        Args:
+            name: the network, such as ``"qvalue_network"``.
+            target: whether those of its target network.
+            frozen: whether without a gradient into them. Otherwise they receive the gradients
+                that the network's own loss sends, see ``separate_losses``.
+        """
+        attribute = f"target_{name}_params" if target else f"{name}_params"
+        shared = self._shared_with_generator.get(attribute, []) if self.separate_losses else []
+        params = getattr(self, attribute)
+        if torch.compiler.is_compiling():
+            if frozen:
+                return params.detach()
+            return without_gradient(params, shared) if shared else params
+        module = getattr(self, name)
+        if shared and not frozen:
+            return leaves(without_gradient(params, shared), module)
+        # Looked up at every call: the parameters may have been replaced since the last one.
+        own = leaves(params, module)
+        return [leaf.detach() for leaf in own] if frozen and torch.is_grad_enabled() else own
+
+    def call(
+        self, name: str, tensordict: TensorDictBase, *, target: bool = False, frozen: bool = False
+    ) -> TensorDictBase:
+        """Runs a network on data.
+
+        Args:
+            name: the network, such as ``"qvalue_network"``.
+            tensordict: what it reads; its output is added.
+            target: whether the target network runs.
+            frozen: whether without a gradient into its parameters, see :meth:`weights`.
+
+        Raises:
+            BMRLError: if the data do not fit the network.
+        """
+        module = getattr(self, name)
+        with holding(module, self.weights(name, target=target, frozen=frozen)):
+            return read(module, tensordict)
+
     # -- reduction -------------------------------------------------------------------------------
 
     def _maybe_get_priority_weight(self, tensordict: TensorDictBase) -> Tensor | None:
-        # TorchRL's own does not find a nested key.
+        # TorchRL's own method does not find a nested key.
         if self.use_prioritized_weights not in (True, "auto"):
             return None
         return tensordict.get(self.tensor_keys.priority_weight, None)
 
     def valid_rows(self, tensordict: TensorDictBase, batch: torch.Size) -> Tensor | None:
-        """Which rows count by the data's masks (``loss_mask_key``); ``None`` if all do.
+        """Mask of the rows that count (``loss_mask_key``), or ``None`` if all do.
 
         Args:
             tensordict: the data.
@@ -307,39 +391,7 @@ class KeyedLoss(LossModule):
             weights = entry(tensordict, self.tensor_keys.priority_weight, valid)
             weights = weights.reshape(loss.shape)
             if valid is not None and self.reduction == "mean":
-                # As TorchRL, and 0 where no row counts.
+                # As in TorchRL, but 0 where no row counts.
                 loss, total = unpadded(loss, valid), weights.sum()
                 return (loss * weights).sum() / torch.where(total == 0, 1.0, total)
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
-
-
-def unpadded(value: Tensor, valid: Tensor | None) -> Tensor:
-    """A number of each row, 0 for the rows that do not count.
-
-    Args:
-        value: ``(..., *B)``.
-        valid: which rows count, ``(*B,)``; ``None`` if all do.
-
-    Example:
-        >>> unpadded(torch.tensor([1.0, torch.nan]), torch.tensor([True, False]))
-        tensor([1., 0.])
-    """
-    return value if valid is None else torch.where(valid, value, torch.zeros_like(value))
-
-
-def average(value: Tensor, valid: Tensor | None) -> Tensor:
-    """Mean of a metric over the rows that count, detached.
-
-    Args:
-        value: ``(..., *B)``.
-        valid: which rows count, ``(*B,)``; ``None`` if all do.
-
-    Example:
-        >>> average(torch.tensor([1.0, 7.0]), torch.tensor([True, False]))
-        tensor(1.)
-    """
-    value = value.detach()
-    if valid is None:
-        return value.mean()
-    number = valid.sum().clamp(min=1) * (value.numel() // valid.numel())
-    return unpadded(value, valid).sum() / number

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
 from torch import Tensor
-from torchrl.data.tensor_specs import TensorSpec
 
-from torchrl_bmrl.errors import BMRLError, UnknownNameError
+from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.functional import bcq_next_value
 from torchrl_bmrl.objectives.checks import check_number, check_value_bounds
 from torchrl_bmrl.objectives.generative import GenerativeLoss
-
-TARGET_DTYPES = ("bfloat16",)
 
 
 class BCQLoss(GenerativeLoss):
     r"""Batch-Constrained deep Q-learning.
 
-    A generator :math:`G`, as published a conditional variational autoencoder, learns which actions
-    the data hold; the critics :math:`Q_j` bootstrap only from actions that :math:`G` proposes.
+    A generator :math:`G`, in the paper a conditional variational autoencoder, learns which actions
+    the data contain. The critics :math:`Q_j` bootstrap only from actions that :math:`G` proposes.
 
     Reference: Fujimoto et al., *Off-Policy Deep Reinforcement Learning without Exploration*, ICML
     2019, https://arxiv.org/abs/1812.02900, algorithm 1.
@@ -39,72 +36,50 @@ class BCQLoss(GenerativeLoss):
        :math:`-Q_1(s, a + \phi\, h\, \xi(s, a))` with :math:`a = G(s, z)` and :math:`h` half the
        action's range
 
-    :meth:`forward` computes all of them with the present parameters; a loop that follows the
-    published order calls the three methods one after the other and steps each optimizer between.
-    There is no target generator. Targets move only under
-    :class:`~torchrl.objectives.SoftUpdate` or :class:`~torchrl.objectives.HardUpdate`.
+    :meth:`forward` computes all of them with the present parameters. To follow the published order,
+    call the three methods one after the other and step each optimizer in between. The generator has
+    no target. :class:`~torchrl.objectives.SoftUpdate` or :class:`~torchrl.objectives.HardUpdate`
+    updates the other targets.
 
     Args:
-        generator: what models the data's actions, such as :class:`torchrl_bmrl.modules.ActionVAE`,
-            or any generator as :mod:`torchrl_bmrl.generators` describes it.
+        generator: model of the data's actions, such as :class:`torchrl_bmrl.modules.ActionVAE`, or
+            any generator as :mod:`torchrl_bmrl.generators` describes it.
         qvalue_network: list of critics (observation, action → ``state_action_value``), each with
-            an initialisation of its own, or one critic, of which ``num_qvalue_nets`` are made.
+            its own initialisation, or one critic, which is copied ``num_qvalue_nets`` times.
         perturbation_network: optional module (observation, action → ``perturbation`` in [-1, 1]).
 
     Keyword Args:
-        action_spec: bounded spec of the action. Exclusive with ``bounds``.
-        bounds: ``(low, high)`` of the action. Exclusive with ``action_spec``.
-        num_qvalue_nets: number of critics; default 2 from a single one, else the list's length.
-        num_candidates: actions proposed per next state. Default 10.
-        lmbda: λ, weight of the critics' minimum against their maximum. Default 0.75.
-        latent_clip: bound on the latent of proposed actions; ``None`` turns it off. Default 0.5.
-        kl_weight: β. Default 0.5, as published.
-        kl_reduction: whether the divergence is the ``"mean"`` (as published) or the ``"sum"``
-            over the latent's dimensions.
-        max_perturbation: φ, a share of half the action's range, in each dimension. Default 0.05.
+        num_qvalue_nets: number of critics; ``None`` for 2 from a single one, or the list's length.
+        num_candidates: actions proposed per next state.
+        lmbda: λ, weight of the critics' minimum against their maximum.
+        latent_clip: bound on the latent of proposed actions; ``None`` for none.
         value_bounds: ``(low, high)`` that the next states' value is clamped to; ``None`` for none.
-            With rewards in [0, 1], (0, 1 / (1 - γ)) holds back a critic that runs away.
-        target_dtype: ``"bfloat16"`` proposes and values the next states' actions in that type
-            (autocast); ``None``, the default, in the networks' own. Faster only where the processor
-            multiplies it faster, see docs/performance.md.
-        loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"`` (Huber) between value and target.
-        gamma: discount of the default TD(0) estimator. Default 0.99.
-        separate_losses: parameters that critics or perturbation network share with the generator
-            are trained by the generator's loss alone.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``; ``None`` is ``"mean"``.
-        deactivate_vmap: run the critics in a loop and not under :func:`torch.vmap`.
-        use_prioritized_weights: ``True``, ``False`` or ``"auto"``, as in TorchRL's losses.
+            With rewards in [0, 1], (0, 1 / (1 - γ)) keeps a critic from diverging.
+        **options: of :class:`~torchrl_bmrl.objectives.GenerativeLoss`: ``action_spec`` or
+            ``bounds``, ``kl_weight`` (β), ``kl_reduction``, ``max_perturbation`` (φ); and of
+            :class:`~torchrl_bmrl.objectives.OfflineLoss`: ``gamma``, ``loss_function``,
+            ``separate_losses``, ``reduction``, ``deactivate_vmap``, ``use_prioritized_weights``.
 
     Keys read: ``observation (*B, obs_dim)``, ``action (*B, action_dim)``, and under ``"next"``
     ``observation``, ``reward``, ``done``, ``terminated``, each of the last three ``(*B, 1)``.
     Key written to the input: ``td_error (*B,)``, the priority.
 
     Raises:
-        BMRLError: for candidates below one, λ outside [0, 1], a generator that lacks a part,
-            bounds that are not the generator's, networks of different sizes, no critics, an
-            unknown ``loss_function``, ``reduction``, ``kl_reduction`` or ``target_dtype``, bounds
-            in the wrong order, or bounds and spec given together or not at all; and at a call for
-            data with missing keys, other shapes or, on CPU and not compiled, numbers that are not
-            finite or actions outside the bounds.
+        BMRLError: for ``num_candidates`` below one, λ outside [0, 1], ``value_bounds`` in the wrong
+            order, no critics, or an option that a base refuses; and at a call for data with missing
+            keys, other shapes or, on CPU and not compiled, numbers that are not finite or actions
+            outside the bounds.
 
     Example:
         >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
         >>> generator = ActionVAE(observation_dim=3, action_dim=2)
         >>> critics = [make_qvalue_network(observation_dim=3, action_dim=2) for _ in range(2)]
         >>> loss = BCQLoss(generator, critics, bounds=(-1.0, 1.0))
-        >>> data = TensorDict(
-        ...     {
-        ...         "observation": torch.randn(8, 3),
-        ...         "action": torch.rand(8, 2) * 2 - 1,
-        ...         "next": {
-        ...             "observation": torch.randn(8, 3),
-        ...             "reward": torch.randn(8, 1),
-        ...             "done": torch.zeros(8, 1, dtype=torch.bool),
-        ...             "terminated": torch.zeros(8, 1, dtype=torch.bool),
-        ...         },
-        ...     },
-        ...     batch_size=[8],
-        ... )
+        >>> flag = torch.zeros(8, 1, dtype=torch.bool)
+        >>> after = {"observation": torch.randn(8, 3), "reward": torch.randn(8, 1)}
+        >>> after |= {"done": flag, "terminated": flag}
+        >>> data = {"observation": torch.randn(8, 3), "action": torch.rand(8, 2) * 2 - 1}
+        >>> data = TensorDict(data | {"next": after}, batch_size=[8])
         >>> losses = loss(data)
         >>> (losses["loss_generator"] + losses["loss_qvalue"]).backward()
     """
@@ -117,45 +92,16 @@ class BCQLoss(GenerativeLoss):
         qvalue_network: TensorDictModule | list[TensorDictModule],
         perturbation_network: TensorDictModule | None = None,
         *,
-        action_spec: TensorSpec | None = None,
-        bounds: tuple[float | Tensor, float | Tensor] | None = None,
         num_qvalue_nets: int | None = None,
         num_candidates: int = 10,
         lmbda: float = 0.75,
         latent_clip: float | None = 0.5,
-        kl_weight: float = 0.5,
-        kl_reduction: str = "mean",
-        max_perturbation: float = 0.05,
         value_bounds: tuple[float, float] | None = None,
-        target_dtype: str | None = None,
-        loss_function: str = "l2",
-        gamma: float = 0.99,
-        separate_losses: bool = False,
-        reduction: str | None = "mean",
-        deactivate_vmap: bool = False,
-        use_prioritized_weights: str | bool = "auto",
+        **options: Any,
     ) -> None:
-        super().__init__(
-            generator,
-            perturbation_network,
-            action_spec=action_spec,
-            bounds=bounds,
-            kl_weight=kl_weight,
-            kl_reduction=kl_reduction,
-            latent_clip=latent_clip,
-            max_perturbation=max_perturbation,
-            loss_function=loss_function,
-            gamma=gamma,
-            separate_losses=separate_losses,
-            reduction=reduction,
-            deactivate_vmap=deactivate_vmap,
-            use_prioritized_weights=use_prioritized_weights,
-        )
+        super().__init__(generator, perturbation_network, latent_clip=latent_clip, **options)
         self.num_candidates = check_number("num_candidates", num_candidates, 1, integer=True)
         self.value_bounds = check_value_bounds(value_bounds)
-        if target_dtype not in (None, *TARGET_DTYPES):
-            raise UnknownNameError("target_dtype", target_dtype, (None, *TARGET_DTYPES))
-        self.target_dtype = target_dtype
         self.register_coefficients(high=1.0, lmbda=lmbda)
         self.convert_critics(qvalue_network, num_qvalue_nets)
         self.finish()
@@ -172,10 +118,10 @@ class BCQLoss(GenerativeLoss):
             "next_state_value",
         ]
 
-    # -- losses, in update order; generator_loss is the base's -----------------------------------
+    # -- losses, in update order; the base has generator_loss ------------------------------------
 
     def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Critics' loss, summed over the critics; gradients reach the critics alone.
+        """Loss of the critics, summed over them; only the critics receive gradients.
 
         Returns:
             the loss and, detached, ``td_error (num_qvalue_nets, *B)``, ``pred_value``,
@@ -183,32 +129,15 @@ class BCQLoss(GenerativeLoss):
         """
         with torch.no_grad():
             after = self.rows(tensordict, self.observation_keys, after=True)
-            with self._target_precision():
-                proposals = self.propose(after, self.num_candidates)
-                proposals = self.perturb(proposals, target=True)
-                candidates = self.qvalue(proposals, target=True)
-            next_value = bcq_next_value(candidates.to(self.lmbda.dtype), self.lmbda)
+            proposals = self.perturb(self.propose(after, self.num_candidates), target=True)
+            next_value = bcq_next_value(self.qvalue(proposals, target=True), self.lmbda)
             if self.value_bounds is not None:
                 next_value = next_value.clamp(*self.value_bounds)
         data = self.rows(tensordict, self.qvalue_network.in_keys)
-        predicted = self.qvalue(data)
-        result = self.temporal_difference(tensordict, predicted, next_value)
-        self._clear_weakrefs(
-            tensordict,
-            data,
-            "generator_params",
-            "qvalue_network_params",
-            "target_qvalue_network_params",
-        )
-        return result
-
-    def _target_precision(self) -> AbstractContextManager[None]:
-        if self.target_dtype is None:
-            return nullcontext()
-        return torch.autocast(self.lmbda.device.type, getattr(torch, self.target_dtype))
+        return self.temporal_difference(tensordict, self.qvalue(data), next_value)
 
     def perturbation_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Perturbation network's loss, -Q of the first critic; gradients reach it alone.
+        """Loss of the perturbation network, -Q of the first critic; only it receives gradients.
 
         Returns:
             the loss, and no metrics.
@@ -223,13 +152,11 @@ class BCQLoss(GenerativeLoss):
             proposal = self.propose(observation, 1).squeeze(-1)
         proposal = self.perturb(proposal)
         value = self.qvalue(proposal, frozen=True)[0]
-        loss = self.reduce(-value, tensordict)
-        self._clear_weakrefs(tensordict, proposal, "perturbation_network_params")
-        return loss, {}
+        return self.reduce(-value, tensordict), {}
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Computes every loss with the present parameters; see the class for keys."""
+        """Computes every loss with the present parameters; the class lists the keys."""
         loss_generator, generator_info = self.generator_loss(tensordict)
         loss_qvalue, qvalue_info = self.qvalue_loss(tensordict)
         tensordict.set(self.tensor_keys.priority, qvalue_info.pop("td_error").amax(0))

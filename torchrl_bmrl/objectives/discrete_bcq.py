@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -12,20 +13,17 @@ from torch import Tensor
 from torchrl.data.tensor_specs import Categorical, OneHot, TensorSpec
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.functional import likely_actions
-from torchrl_bmrl.objectives.base import average
-from torchrl_bmrl.objectives.checks import (
+from torchrl_bmrl.functional import average, likely_actions
+from torchrl_bmrl.generators import written
+from torchrl_bmrl.objectives.checks import check_network, leaf_of
+from torchrl_bmrl.objectives.common import OfflineLoss
+from torchrl_bmrl.objectives.data import (
     check_index,
-    check_network,
     check_one_hot,
     check_same_shape,
     entry,
-    leaf_of,
-    missing,
     next_key,
-    output,
 )
-from torchrl_bmrl.objectives.common import OfflineLoss
 
 ACTION_SPACES = ("one-hot", "categorical")
 
@@ -33,7 +31,7 @@ ACTION_SPACES = ("one-hot", "categorical")
 class DiscreteBCQLoss(OfflineLoss):
     r"""Discrete Batch-Constrained deep Q-learning.
 
-    A classifier :math:`G` learns which actions the data hold; the critics bootstrap only from
+    A classifier :math:`G` learns which actions the data contain. The critics bootstrap only from
     actions that are likely enough under it.
 
     Reference: Fujimoto et al., *Benchmarking Batch Deep Reinforcement Learning Algorithms*, 2019,
@@ -47,28 +45,24 @@ class DiscreteBCQLoss(OfflineLoss):
        :math:`y = r + \gamma (1 - \mathrm{terminated}) \min_j Q'_j(s', a')`,
        :math:`a' = \arg\max_{a} \{\min_j Q_j(s', a) : G(a|s') / \max_{a} G(a|s') > \tau\}`
 
-    One critic is the published algorithm (Double DQN within the likely actions); several are
-    clipped to their minimum.
+    With one critic this is the published algorithm (Double DQN within the likely actions); of
+    several the minimum counts.
 
     Args:
         generator: classifier of the data's actions (observation → ``logits (*B, n)``).
         qvalue_network: critic, or list of critics (observation → ``action_value (*B, n)``).
 
     Keyword Args:
-        action_space: how ``action`` is written: ``"one-hot"`` (or ``"one_hot"``), ``(*B, n)``, as
+        action_space: format of ``action``: ``"one-hot"`` (or ``"one_hot"``), ``(*B, n)``, as
             :class:`~torchrl.envs.GymEnv` has it, ``"categorical"``, ``(*B,)`` or ``(*B, 1)``, or
-            the spec of the action, :class:`~torchrl.data.OneHot` or
-            :class:`~torchrl.data.Categorical`.
-        num_qvalue_nets: number of critics; default 1 from a single one, else the list's length.
-        threshold: τ. Default 0.3. 0 is Double DQN, 1 is imitation.
-        logits_weight: w. Default 0.01.
-        loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"`` (Huber, the default).
-        gamma: discount of the default TD(0) estimator. Default 0.99.
-        separate_losses: parameters that the critics share with the generator are trained by the
-            generator's loss alone. Default ``False``, as published for a common convolution.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``; ``None`` is ``"mean"``.
-        deactivate_vmap: run the critics in a loop and not under :func:`torch.vmap`.
-        use_prioritized_weights: ``True``, ``False`` or ``"auto"``, as in TorchRL's losses.
+            the action's spec, :class:`~torchrl.data.OneHot` or :class:`~torchrl.data.Categorical`.
+        num_qvalue_nets: number of critics; ``None`` for 1 from a single one, or the list's length.
+        threshold: τ. 0 is Double DQN, 1 is imitation.
+        logits_weight: w.
+        loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"`` (Huber) between value and target.
+        **options: of :class:`~torchrl_bmrl.objectives.OfflineLoss`: ``gamma``,
+            ``separate_losses`` (off, as published for a shared convolution), ``reduction``,
+            ``deactivate_vmap``, ``use_prioritized_weights``.
 
     Keys read: ``observation (*B, ...)``, ``action``, and under ``"next"`` ``observation``,
     ``reward``, ``done``, ``terminated``, each of the last three ``(*B, 1)``. Key written to the
@@ -84,36 +78,25 @@ class DiscreteBCQLoss(OfflineLoss):
         >>> def network(name):
         ...     return TensorDictModule(MLP(4, 2), in_keys=["observation"], out_keys=[name])
         >>> loss = DiscreteBCQLoss(network("logits"), network("action_value"))
-        >>> data = TensorDict(
-        ...     {
-        ...         "observation": torch.randn(8, 4),
-        ...         "action": torch.eye(2)[torch.randint(2, (8,))],
-        ...         "next": {
-        ...             "observation": torch.randn(8, 4),
-        ...             "reward": torch.randn(8, 1),
-        ...             "done": torch.zeros(8, 1, dtype=torch.bool),
-        ...             "terminated": torch.zeros(8, 1, dtype=torch.bool),
-        ...         },
-        ...     },
-        ...     batch_size=[8],
-        ... )
+        >>> flag = torch.zeros(8, 1, dtype=torch.bool)
+        >>> after = {"observation": torch.randn(8, 4), "reward": torch.randn(8, 1)}
+        >>> after |= {"done": flag, "terminated": flag}
+        >>> data = {
+        ...     "observation": torch.randn(8, 4),
+        ...     "action": torch.eye(2)[torch.randint(2, (8,))],
+        ... }
+        >>> data = TensorDict(data | {"next": after}, batch_size=[8])
         >>> losses = loss(data)
         >>> (losses["loss_generator"] + losses["loss_qvalue"]).backward()
     """
 
     @dataclass
     class _AcceptedKeys(OfflineLoss._AcceptedKeys):
-        """Keys that ``set_keys`` can rename; those of the base and these.
+        """Keys that ``set_keys`` can rename: those of the base and these."""
 
-        Attributes:
-            logits: the generator's output.
-            action_value: the critics' output, the value of every action.
-            state_action_value: where the value of the chosen next action is written.
-        """
-
-        logits: NestedKey = "logits"
-        action_value: NestedKey = "action_value"
-        state_action_value: NestedKey = "chosen_action_value"
+        logits: NestedKey = "logits"  # the generator's output
+        action_value: NestedKey = "action_value"  # the critics' output
+        state_action_value: NestedKey = "chosen_action_value"  # the value of the next action
 
     default_keys = _AcceptedKeys
     _schedulable_buffers = frozenset({"threshold", "logits_weight"})
@@ -132,20 +115,9 @@ class DiscreteBCQLoss(OfflineLoss):
         threshold: float = 0.3,
         logits_weight: float = 1e-2,
         loss_function: str = "smooth_l1",
-        gamma: float = 0.99,
-        separate_losses: bool = False,
-        reduction: str | None = "mean",
-        deactivate_vmap: bool = False,
-        use_prioritized_weights: str | bool = "auto",
+        **options: Any,
     ) -> None:
-        super().__init__(
-            loss_function=loss_function,
-            gamma=gamma,
-            separate_losses=separate_losses,
-            reduction=reduction,
-            deactivate_vmap=deactivate_vmap,
-            use_prioritized_weights=use_prioritized_weights,
-        )
+        super().__init__(loss_function=loss_function, **options)
         self.action_space, self.num_actions = action_space_of(action_space, self.tensor_keys.action)
         check_network("generator", generator)
         self.check_sizes("generator", generator)
@@ -182,22 +154,9 @@ class DiscreteBCQLoss(OfflineLoss):
 
     # -- actions and values ----------------------------------------------------------------------
 
-    def batch_shape(self, tensordict: TensorDictBase) -> torch.Size:
-        """The shape ``*B`` of the data, told by the action.
-
-        Raises:
-            BMRLError: if the data have no action.
-        """
-        self.check_names()
-        key = self.tensor_keys.action
-        action = tensordict.get(key, None)
-        if action is None:
-            raise missing(tensordict, key, self.readers(key))
-        flat = self.action_space == "categorical" and action.ndim == max(tensordict.ndim, 1)
-        batch = action.shape if flat else action.shape[:-1]
-        if self._cold:
-            self._warm_up(tensordict, batch)
-        return batch
+    def _batch_of(self, action: Tensor, ndim: int) -> torch.Size:
+        flat = self.action_space == "categorical" and action.ndim == max(ndim, 1)
+        return action.shape if flat else action.shape[:-1]
 
     def action_index(self, tensordict: TensorDictBase, num_actions: int) -> Tensor:
         """Index of the data's action, ``(*B,)``.
@@ -237,7 +196,7 @@ class DiscreteBCQLoss(OfflineLoss):
             BMRLError: if the action's spec knows another number of actions.
         """
         data = self.rows(tensordict, self.generator.in_keys, after=after)
-        logits = output(self.call("generator", data), self.tensor_keys.logits, self.generator)
+        logits = written(self.call("generator", data), self.tensor_keys.logits, self.generator)
         if self.num_actions not in (None, logits.shape[-1]):
             raise BMRLError(
                 f"{self.tensor_keys.logits!r} has the shape {tuple(logits.shape)}, and the spec of "
@@ -275,7 +234,7 @@ class DiscreteBCQLoss(OfflineLoss):
     # -- losses, in update order -----------------------------------------------------------------
 
     def generator_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Classifier's loss; gradients reach the generator alone.
+        """Loss of the classifier; only the generator receives gradients.
 
         Returns:
             the loss and, detached, ``cross_entropy``.
@@ -285,12 +244,11 @@ class DiscreteBCQLoss(OfflineLoss):
         cross_entropy = -logits.log_softmax(-1).gather(-1, action.unsqueeze(-1)).squeeze(-1)
         loss = cross_entropy + self.logits_weight * logits.square().mean(-1)
         loss = self.reduce(loss, tensordict)
-        self._clear_weakrefs(tensordict, "generator_params")
         valid = self.valid_rows(tensordict, cross_entropy.shape)
         return loss, {"cross_entropy": average(cross_entropy, valid)}
 
     def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Critics' loss, summed over the critics; gradients reach the critics alone.
+        """Loss of the critics, summed over them; only the critics receive gradients.
 
         Returns:
             the loss and, detached, ``td_error (num_qvalue_nets, *B)``, ``pred_value``,
@@ -308,19 +266,11 @@ class DiscreteBCQLoss(OfflineLoss):
         value = self.qvalue(data)
         index = self.action_index(tensordict, value.shape[-1]).expand(value.shape[:-1])
         predicted = value.gather(-1, index.unsqueeze(-1)).squeeze(-1)
-        result = self.temporal_difference(tensordict, predicted, next_value)
-        self._clear_weakrefs(
-            tensordict,
-            data,
-            "generator_params",
-            "qvalue_network_params",
-            "target_qvalue_network_params",
-        )
-        return result
+        return self.temporal_difference(tensordict, predicted, next_value)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Computes both losses with the present parameters; see the class for keys."""
+        """Computes both losses with the present parameters; the class lists the keys."""
         loss_generator, generator_info = self.generator_loss(tensordict)
         loss_qvalue, qvalue_info = self.qvalue_loss(tensordict)
         tensordict.set(self.tensor_keys.priority, qvalue_info.pop("td_error").amax(0))
@@ -331,11 +281,11 @@ class DiscreteBCQLoss(OfflineLoss):
 def action_space_of(
     action_space: str | TensorSpec, action_key: NestedKey
 ) -> tuple[str, int | None]:
-    """How actions are written, and how many there are where a spec says it.
+    """Format of the actions, and their number where a spec has it.
 
     Args:
         action_space: ``"one-hot"``, ``"one_hot"``, ``"categorical"``, or a spec.
-        action_key: where the spec lies in a composite one.
+        action_key: of the action in a composite spec.
 
     Raises:
         UnknownNameError: for anything else.
@@ -345,7 +295,7 @@ def action_space_of(
         (('one-hot', None), ('one-hot', 4))
     """
     action_space = leaf_of(action_space, action_key)
-    # Their own classes alone: those of several actions at once derive from them.
+    # These classes exactly: specs of several actions at once derive from them.
     if type(action_space) is OneHot:
         return "one-hot", action_space.space.n
     if type(action_space) is Categorical:

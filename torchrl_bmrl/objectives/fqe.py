@@ -13,16 +13,18 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs.utils import set_exploration_type
 
-from torchrl_bmrl.objectives.checks import check_network, entry, next_key, output
+from torchrl_bmrl.generators import written
+from torchrl_bmrl.objectives.checks import check_network
 from torchrl_bmrl.objectives.common import OfflineLoss
+from torchrl_bmrl.objectives.data import entry, next_key
 from torchrl_bmrl.objectives.ensemble import kind
 
 
 class FQELoss(OfflineLoss):
-    r"""Fitted Q evaluation: what a policy would return, learned from a fixed batch.
+    r"""Fitted Q evaluation: estimates a policy's return from a fixed batch.
 
-    Critics :math:`Q_j` of a policy :math:`\pi` that stays as it is. They rank policies, such as the
-    checkpoints of a training, where there is no simulator to run them in.
+    It learns critics :math:`Q_j` of a policy :math:`\pi` that does not change. Their estimates rank
+    policies, such as the checkpoints of a training run, without a simulator.
 
     Reference: Le, Voloshin and Yue, *Batch Policy Learning under Constraints*, ICML 2019,
     https://arxiv.org/abs/1903.08738, algorithm 3.
@@ -31,29 +33,29 @@ class FQELoss(OfflineLoss):
         L = \sum_j (Q_j(s, a) - y)^2,\quad y = r + \gamma\, (1 - \mathrm{terminated})\,
         \frac{1}{n} \sum_j Q'_j(s', \pi(s'))
 
-    where the published algorithm fits one critic to the end before its target moves, here the
-    target moves under :class:`~torchrl.objectives.HardUpdate`, which does the same at a long
-    interval, or :class:`~torchrl.objectives.SoftUpdate`. :meth:`policy_value` is the estimate.
+    The published algorithm fits one critic to convergence before its target moves. Here the target
+    moves under :class:`~torchrl.objectives.HardUpdate`, which does the same at a long interval, or
+    :class:`~torchrl.objectives.SoftUpdate`. :meth:`policy_value` returns the estimate.
 
-    The policy is copied, in evaluation mode: no gradient reaches it, no optimizer finds it, and
-    later updates of the given one do not reach the copy. ``state_dict()`` holds it under
+    The policy is copied, in evaluation mode: it receives no gradient, no optimizer finds it, and
+    later updates of the original do not reach the copy. ``state_dict()`` contains it under
     ``policy_params``. A policy that draws, such as :class:`~torchrl_bmrl.modules.BCQPolicy`, draws
-    anew at every call; a probabilistic module of TorchRL acts by its mode, as in every loss, unless
-    ``deterministic_sampling_mode`` says otherwise.
+    anew at every call. A probabilistic module of TorchRL acts by its mode, as in every loss, unless
+    ``deterministic_sampling_mode`` is changed.
 
     Args:
         policy: any module that writes the action, such as
             :class:`~torchrl_bmrl.modules.BCQPolicy`, :class:`~torchrl_bmrl.modules.PLASPolicy` or
             :class:`~torchrl_bmrl.modules.DiscreteBCQPolicy`.
         qvalue_network: list of critics (observation, action → ``state_action_value``), each with
-            an initialisation of its own, or one critic, of which ``num_qvalue_nets`` are made. A
+            its own initialisation, or one critic, which is copied ``num_qvalue_nets`` times. A
             critic of discrete actions reads them one-hot; one that writes the value of every action
             is not accepted.
 
     Keyword Args:
-        num_qvalue_nets: number of critics; default 1 from a single one, else the list's length.
+        num_qvalue_nets: number of critics; ``None`` for 1 from a single one, or the list's length.
         **options: of :class:`~torchrl_bmrl.objectives.OfflineLoss`, such as ``gamma`` and
-            ``loss_function``; there is no generator that ``separate_losses`` could speak of.
+            ``loss_function``. Without a generator ``separate_losses`` has no effect.
 
     Keys read: ``observation (*B, obs_dim)``, ``action (*B, action_dim)``, and under ``"next"``
     ``observation``, ``reward``, ``done``, ``terminated``, each of the last three ``(*B, 1)``.
@@ -70,19 +72,11 @@ class FQELoss(OfflineLoss):
         >>> from torchrl_bmrl.modules import make_qvalue_network
         >>> policy = PLASPolicy(make_latent_actor(3, 4), ActionVAE(3, 2).decoder)
         >>> loss = FQELoss(policy, make_qvalue_network(3, 2), gamma=0.9)
-        >>> data = TensorDict(
-        ...     {
-        ...         "observation": torch.randn(8, 3),
-        ...         "action": torch.rand(8, 2) * 2 - 1,
-        ...         "next": {
-        ...             "observation": torch.randn(8, 3),
-        ...             "reward": torch.randn(8, 1),
-        ...             "done": torch.zeros(8, 1, dtype=torch.bool),
-        ...             "terminated": torch.zeros(8, 1, dtype=torch.bool),
-        ...         },
-        ...     },
-        ...     batch_size=[8],
-        ... )
+        >>> flag = torch.zeros(8, 1, dtype=torch.bool)
+        >>> after = {"observation": torch.randn(8, 3), "reward": torch.randn(8, 1)}
+        >>> after |= {"done": flag, "terminated": flag}
+        >>> data = {"observation": torch.randn(8, 3), "action": torch.rand(8, 2) * 2 - 1}
+        >>> data = TensorDict(data | {"next": after}, batch_size=[8])
         >>> loss(data)["loss_qvalue"].backward()
         >>> loss.policy_value(data[:2].select("observation")).shape
         torch.Size([])
@@ -103,12 +97,12 @@ class FQELoss(OfflineLoss):
         check_network("policy", policy)
         policy = deepcopy(policy).eval()
         params = TensorDict.from_module(policy)
-        # Buffers of the loss; the module keeps only where they belong, as TorchRL's networks do.
+        # The loss holds the parameters, as buffers; the module keeps only their places.
         self.policy_params = TensorDictParams(params.data, no_convert=True)
         meta = params.apply(self._make_meta_params, device=torch.device("meta"), filter_empty=False)
         meta.to_module(policy)
         self.__dict__["policy"] = policy
-        self.policy_kind = kind(policy)  # by which a StackedLoss tells its members apart
+        self.policy_kind = kind(policy)  # a StackedLoss compares it between members
         self.convert_critics(qvalue_network, num_qvalue_nets, default=1)
         self.finish()
 
@@ -128,7 +122,7 @@ class FQELoss(OfflineLoss):
         return ["loss_qvalue", "pred_value", "target_value", "next_state_value"]
 
     def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Critics' loss, summed over the critics; gradients reach the critics alone.
+        """Loss of the critics, summed over them; only the critics receive gradients.
 
         Returns:
             the loss and, detached, ``td_error (num_qvalue_nets, *B)``, ``pred_value``,
@@ -138,21 +132,16 @@ class FQELoss(OfflineLoss):
             after = self.rows(tensordict, self.observation_keys, after=True)
             next_value = self.state_value(after, target=True)
         data = self.rows(tensordict, self.qvalue_network.in_keys)
-        predicted = self.qvalue(data)
-        result = self.temporal_difference(tensordict, predicted, next_value)
-        self._clear_weakrefs(
-            tensordict, data, "qvalue_network_params", "target_qvalue_network_params"
-        )
-        return result
+        return self.temporal_difference(tensordict, self.qvalue(data), next_value)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Computes the loss with the present parameters; see the class for keys."""
+        """Computes the loss with the present parameters; the class lists the keys."""
         loss_qvalue, info = self.qvalue_loss(tensordict)
         tensordict.set(self.tensor_keys.priority, info.pop("td_error").amax(0))
         return TensorDict({"loss_qvalue": loss_qvalue} | info)
 
-    # -- what the policy is worth ----------------------------------------------------------------
+    # -- value of the policy ---------------------------------------------------------------------
 
     def state_value(self, observation: TensorDictBase, *, target: bool = False) -> Tensor:
         r"""Value of states under the policy, :math:`\frac{1}{n} \sum_j Q_j(s, \pi(s))`, ``(*B,)``.
@@ -165,7 +154,7 @@ class FQELoss(OfflineLoss):
             BMRLError: if the policy writes no action, or the state does not fit the networks.
         """
         data = self.call("policy", observation.copy(), frozen=True)
-        output(data, self.tensor_keys.action, self.policy)
+        written(data, self.tensor_keys.action, self.policy)
         return self.qvalue(data, target=target).mean(0)
 
     @torch.no_grad()
@@ -178,8 +167,8 @@ class FQELoss(OfflineLoss):
             tensordict: start states, batch ``[*B]``, with what policy and critics read of a state.
 
         Returns:
-            the estimate, without gradient, in the reward's unit. Where episodes are cut off and
-            not terminated it counts on as if they were not.
+            the estimate, without gradient, in the reward's unit. An episode that is truncated
+            counts as if it went on.
 
         Raises:
             BMRLError: for missing keys, other shapes or, on CPU and not compiled, numbers that are

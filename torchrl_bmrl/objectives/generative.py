@@ -1,4 +1,4 @@
-"""What losses share whose policy stays within a generative model of the data's actions."""
+"""Base of the losses whose policy stays close to a generative model of the data's actions."""
 
 from __future__ import annotations
 
@@ -15,46 +15,44 @@ from torch import Tensor
 from torchrl.data.tensor_specs import Bounded, TensorSpec
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.functional import perturbed_action
-from torchrl_bmrl.generators import LOSS_OPTIONS, PROPOSAL_OPTIONS, as_generator, check_written
-from torchrl_bmrl.objectives.base import average
-from torchrl_bmrl.objectives.checks import (
-    check_network,
-    check_same_shape,
-    check_within,
-    leaf_of,
-    next_key,
-    output,
-    unfit,
+from torchrl_bmrl.functional import average, perturbed_action
+from torchrl_bmrl.generators import (
+    LOSS_OPTIONS,
+    PROPOSAL_OPTIONS,
+    as_generator,
+    check_bounds,
+    written,
 )
+from torchrl_bmrl.objectives.checks import check_network, leaf_of
 from torchrl_bmrl.objectives.common import OfflineLoss
-from torchrl_bmrl.objectives.swap import holding
+from torchrl_bmrl.objectives.data import check_same_shape, check_within, next_key
+from torchrl_bmrl.objectives.swap import holding, unfit
 
 KL_REDUCTIONS = ("mean", "sum")
 
 
 class GenerativeLoss(OfflineLoss):
-    r"""Base of losses around a generator of the data's actions.
+    r"""Base of losses with a generator of the data's actions.
 
-    It brings the generator's own loss, :meth:`generator_loss`, its proposals, :meth:`propose`, and
-    for a generator with a latent the way from there to an action, :meth:`decode`, and back,
-    :meth:`encode`. The generator has no target.
+    It provides the generator's own loss (:meth:`generator_loss`), its proposals (:meth:`propose`)
+    and, for a generator with a latent, the map from the latent to an action (:meth:`decode`) and
+    back (:meth:`encode`). The generator has no target.
 
     Args:
-        generator: what models the data's actions, see :mod:`torchrl_bmrl.generators`; such as
+        generator: model of the data's actions, see :mod:`torchrl_bmrl.generators`; such as
             :class:`torchrl_bmrl.modules.ActionVAE`. A module with ``encoder`` (observation, action
             → ``action_latent_loc``, ``action_latent_scale``), ``decoder`` (observation,
-            ``action_latent`` → action) and ``latent_dim`` is taken for an autoencoder.
+            ``action_latent`` → action) and ``latent_dim`` is used as an autoencoder.
         perturbation_network: optional module (observation, action → ``perturbation`` in [-1, 1]).
 
     Keyword Args:
         action_spec: bounded spec of the action. Exclusive with ``bounds``.
         bounds: ``(low, high)`` of the action. Exclusive with ``action_spec``.
         kl_weight: β, of an autoencoder.
-        kl_reduction: whether an autoencoder's divergence is the ``"mean"`` or the ``"sum"`` over
-            the latent's dimensions.
+        kl_reduction: whether an autoencoder's divergence is the ``"mean"`` (as published) or the
+            ``"sum"`` over the latent's dimensions.
         latent_clip: bound on the latent of proposed actions, ``None`` for none.
-        max_perturbation: φ, a share of half the action's range.
+        max_perturbation: φ, a share of half the action's range in each dimension.
         **options: of :class:`~torchrl_bmrl.objectives.common.OfflineLoss`.
 
     Raises:
@@ -66,7 +64,7 @@ class GenerativeLoss(OfflineLoss):
     Example:
         >>> from tensordict import TensorDict
         >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
-        >>> loss = GenerativeLoss(ActionVAE(3, 2), bounds=(-1.0, 1.0))  # as a subclass does it
+        >>> loss = GenerativeLoss(ActionVAE(3, 2), bounds=(-1.0, 1.0))  # as in a subclass
         >>> loss.convert_critics(make_qvalue_network(3, 2), num_qvalue_nets=2)
         >>> data = TensorDict({"observation": torch.zeros(8, 3), "action": torch.zeros(8, 2)}, [8])
         >>> value, metrics = loss.generator_loss(data)
@@ -76,19 +74,12 @@ class GenerativeLoss(OfflineLoss):
 
     @dataclass
     class _AcceptedKeys(OfflineLoss._AcceptedKeys):
-        """Keys that ``set_keys`` can rename; those of the base and these.
+        """Keys that ``set_keys`` can rename: those of the base and these."""
 
-        Attributes:
-            action_latent: the VAE's z, read by the decoder.
-            action_latent_loc: mean of the encoder's posterior.
-            action_latent_scale: its standard deviation.
-            perturbation: the perturbation network's output.
-        """
-
-        action_latent: NestedKey = "action_latent"
-        action_latent_loc: NestedKey = "action_latent_loc"
-        action_latent_scale: NestedKey = "action_latent_scale"
-        perturbation: NestedKey = "perturbation"
+        action_latent: NestedKey = "action_latent"  # the VAE's z, read by the decoder
+        action_latent_loc: NestedKey = "action_latent_loc"  # mean of the encoder's posterior
+        action_latent_scale: NestedKey = "action_latent_scale"  # its standard deviation
+        perturbation: NestedKey = "perturbation"  # the perturbation network's output
 
     default_keys = _AcceptedKeys
     _schedulable_buffers = frozenset({"kl_weight", "latent_clip", "max_perturbation"})
@@ -124,7 +115,8 @@ class GenerativeLoss(OfflineLoss):
         self.check_sizes("generator", generator)
         self.convert_to_functional(generator, "generator", create_target_params=False)
         low, high = action_bounds(action_spec, bounds, self.tensor_keys.action)
-        self._check_bounds(low, high)
+        size = (getattr(generator, "sizes", None) or {}).get(self.tensor_keys.action)
+        check_bounds((low, high), generator, size)
         self.register_buffer("action_low", low.to(**self._type_and_device))
         self.register_buffer("action_high", high.to(**self._type_and_device))
         if perturbation_network is None:
@@ -141,37 +133,9 @@ class GenerativeLoss(OfflineLoss):
             self.register_coefficients(kl_weight=kl_weight)
         self.register_coefficients(latent_clip=latent_clip, optional=True)
 
-    def _check_bounds(self, low: Tensor, high: Tensor) -> None:
-        """Refuses bounds that say something else than the generator."""
-        size = (getattr(self.generator, "sizes", None) or {}).get(self.tensor_keys.action)
-        own = getattr(self.generator, "bounds", None)
-        for name, bound, other in zip(
-            ("lower", "upper"), (low, high), own or (None, None), strict=True
-        ):
-            if size is not None and bound.ndim and len(bound) != size:
-                raise BMRLError(
-                    f"the {name} bound of the action has {len(bound)} numbers; valid: a number, or "
-                    f"{size}, as the generator's actions have"
-                )
-            if other is None:
-                continue
-            other = torch.as_tensor(other)
-            if other.ndim and bound.ndim and len(other) != len(bound):
-                raise BMRLError(
-                    f"the {name} bound of the action has {len(bound)} numbers, and the generator's "
-                    f"{len(other)}; valid: as many"
-                )
-            one, two = torch.broadcast_tensors(bound.double(), other.double().to(bound.device))
-            if not torch.allclose(one, two):
-                raise BMRLError(
-                    f"the {name} bound of the action is {bound.tolist()}, and the generator's "
-                    f"{other.tolist()}; valid: equal ones, such as "
-                    "ActionVAE(..., bounds=(spec.space.low, spec.space.high))"
-                )
-
     def _refuse_unread(self, **options: Any) -> None:
-        """Refuses an option that was given and that the generator does not take."""
-        parameters = inspect.signature(type(self).__init__).parameters
+        """Raises for an option with another value than its default that the generator lacks."""
+        parameters = inspect.signature(type(self)).parameters
         for name, value in options.items():
             given = name in parameters and value != parameters[name].default
             if given and name not in self.generator.options:
@@ -181,12 +145,12 @@ class GenerativeLoss(OfflineLoss):
                 )
 
     def _options(self, names: tuple[str, ...]) -> dict[str, Any]:
-        """Those of some options that the generator takes."""
+        """The values of those options that the generator takes."""
         return {name: getattr(self, name) for name in names if name in self.generator.options}
 
     @property
     def observation_keys(self) -> list[NestedKey]:
-        """What generator and ``state_networks`` read of a state."""
+        """Keys that the generator and ``state_networks`` read of a state."""
         networks = [getattr(self, name) for name in self.state_networks]
         keys = [key for network in networks if network is not None for key in network.in_keys]
         made = (self.tensor_keys.action_latent, self.tensor_keys.action)
@@ -201,7 +165,7 @@ class GenerativeLoss(OfflineLoss):
 
     @property
     def _training_keys(self) -> list[NestedKey]:
-        """What the generator's own loss reads beside the action."""
+        """Keys that the generator's own loss reads beside the action."""
         return getattr(self.generator, "encoder", self.generator).in_keys
 
     @property
@@ -209,12 +173,12 @@ class GenerativeLoss(OfflineLoss):
         """Names of the metrics of :meth:`generator_loss`, for ``written_keys``."""
         return list(self.generator.metrics)
 
-    # -- from a state to actions -----------------------------------------------------------------
+    # -- proposed actions ------------------------------------------------------------------------
 
     def propose(self, observation: TensorDictBase, num_candidates: int) -> TensorDictBase:
-        """The observation with actions that the generator proposes, a draw for each.
+        """The observation with proposed actions, each from a draw of its own.
 
-        No gradient reaches the generator.
+        The generator receives no gradient.
 
         Args:
             observation: what the generator reads of a state, batch ``[*B]``.
@@ -231,13 +195,13 @@ class GenerativeLoss(OfflineLoss):
         with holding(self.generator, self.weights("generator", frozen=True)):
             proposed = self._ask(self.generator.propose, observation, num_candidates, **options)
         if proposed.get(keys.action, None) is None:
-            check_written(proposed, keys.action, self.generator)
+            written(proposed, keys.action, self.generator)
         return proposed
 
     def decode(self, observation: TensorDictBase, latent: Tensor) -> TensorDictBase:
-        """The observation with the latent and the action that the generator decodes from it.
+        """The observation with the latent and the action decoded from it.
 
-        A gradient may reach the latent, never the generator.
+        The latent may receive a gradient, the generator does not.
 
         Args:
             observation: what the decoder reads beside z, batch ``[*B]``.
@@ -252,7 +216,7 @@ class GenerativeLoss(OfflineLoss):
     def encode(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The data with the mean and standard deviation of the posterior of z.
 
-        A gradient may reach the action, never the generator.
+        The action may receive a gradient, the generator does not.
 
         Args:
             tensordict: observation and action, batch ``[*B]``.
@@ -275,7 +239,7 @@ class GenerativeLoss(OfflineLoss):
             return self._ask(getattr(self.generator, method), data)
 
     def _ask(self, method: Any, data: TensorDictBase, *args: Any, **options: Any) -> Any:
-        """Calls a method of the generator, which holds its parameters."""
+        """Calls a method of the generator and explains errors about the data."""
         if torch.compiler.is_compiling():
             return method(data, *args, self.tensor_keys, **options)
         try:
@@ -288,7 +252,7 @@ class GenerativeLoss(OfflineLoss):
             raise unfit(self.generator, data, error, also) from error
 
     def perturb(self, tensordict: TensorDictBase, *, target: bool = False) -> TensorDictBase:
-        """Moves the action by the perturbation network, if there is one.
+        """Adds the perturbation network's output to the action, if there is such a network.
 
         Args:
             tensordict: observation and action, batch ``[*B]``.
@@ -302,7 +266,7 @@ class GenerativeLoss(OfflineLoss):
         keys = self.tensor_keys
         tensordict = self.call("perturbation_network", tensordict, target=target)
         action = tensordict.get(keys.action)
-        perturbation = output(tensordict, keys.perturbation, self.perturbation_network)
+        perturbation = written(tensordict, keys.perturbation, self.perturbation_network)
         check_same_shape(keys.perturbation, perturbation, action)
         action = perturbed_action(
             action, perturbation, self.max_perturbation, self.action_low, self.action_high
@@ -312,7 +276,7 @@ class GenerativeLoss(OfflineLoss):
     # -- loss ------------------------------------------------------------------------------------
 
     def generator_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The generator's own loss, such as :meth:`.Autoencoder.row_loss`; nothing else learns.
+        """Loss of the generator, such as :meth:`.Autoencoder.row_loss`; only it receives gradients.
 
         Returns:
             the loss and, detached, the generator's metrics: of an autoencoder
@@ -330,7 +294,6 @@ class GenerativeLoss(OfflineLoss):
         with holding(self.generator, self.weights("generator")):
             loss, metrics = self._ask(self.generator.row_loss, data, **self._options(LOSS_OPTIONS))
         loss = self.reduce(loss, tensordict)
-        self._clear_weakrefs(tensordict, data, "generator_params")
         return loss, {name: average(value, valid) for name, value in metrics.items()}
 
 

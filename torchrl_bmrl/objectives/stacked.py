@@ -1,4 +1,4 @@
-"""Several losses of one kind as one: the agents of all tasks and seeds in one program."""
+"""Several losses of one kind as one loss, such as the agents of all tasks and seeds."""
 
 from __future__ import annotations
 
@@ -9,37 +9,58 @@ from functools import partial
 from typing import Any, TypeVar
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.value import TD0Estimator
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.objectives.checks import entry, is_lazy
-from torchrl_bmrl.objectives.ensemble import kind
+from torchrl_bmrl.objectives.data import entry
+from torchrl_bmrl.objectives.stacking import (
+    are_equal,
+    check_members,
+    is_trained,
+    join,
+    stack_params,
+    state_of,
+)
 from torchrl_bmrl.ownership import note_copied
 
 Self = TypeVar("Self", bound="StackedLoss")
 
 
-class StackedLoss(LossModule):
-    """N losses of one kind, member i of which sees row i of the data and has parameters of its own.
+def _of_members(name: str, doc: str) -> Any:
+    """A property of a stack that reads one member's attribute and sets every member's."""
 
-    It is used as one of them is. ``forward`` takes a batch ``[N, *B]``; of members that reduce
-    their losses it returns each ``loss_*`` summed over the members, so that one ``backward()``
-    gives each member its own gradient, and every metric, ``[N]``. The methods ``generator_loss``,
-    ``qvalue_loss``, ... return the losses and metrics of each member, ``[N]``. Keys, estimators,
-    masks and coefficients are set for all members at once, ``stack.set_keys(...)``.
-    ``generator_params``, ``qvalue_network_params``, ... hold the parameters of all members,
+    def read(self: StackedLoss) -> Any:
+        template = self.__dict__.get("_template")
+        return None if template is None else getattr(template, name)
+
+    def write(self: StackedLoss, value: Any) -> None:
+        for loss in self._all() if "_template" in self.__dict__ else ():
+            setattr(loss, name, value)
+
+    return property(read, write, doc=doc)
+
+
+class StackedLoss(LossModule):
+    """N losses of one kind; member i reads row i of the data and has its own parameters.
+
+    It is used like one of them. ``forward`` takes a batch ``[N, *B]``. If the members reduce their
+    losses, it returns each ``loss_*`` summed over the members, so that one ``backward()`` gives
+    each member its own gradient, and every metric of each member, ``[N]``. The methods
+    ``generator_loss``, ``qvalue_loss``, ... return the losses and metrics of each member, ``[N]``.
+    ``stack.set_keys(...)``, masks, estimators and coefficients apply to all members.
+    ``generator_params``, ``qvalue_network_params``, ... contain the parameters of all members,
     ``[N, ...]``, for one optimizer and one :class:`~torchrl.objectives.SoftUpdate`. On a GPU the
-    members run as one program under :func:`torch.vmap`; on a CPU one after the other, where that
-    is faster.
+    members run as one program under :func:`torch.vmap`, on a CPU one after the other, which is
+    faster there.
 
     Args:
-        losses: the members; equal in kind, networks' shapes and options, but for coefficients that
-            are buffers, such as ``kl_weight``, which each member keeps. Their parameters are
-            copied: to see what training made of them ask :meth:`member`.
+        losses: the members. They must be equal in class, networks' shapes and options, except for
+            coefficients that are buffers, such as ``kl_weight``, which each member keeps. Their
+            parameters are copied: :meth:`member` returns a trained one.
         names: of the members, for messages; by default their numbers.
 
     Keyword Args:
@@ -84,23 +105,23 @@ class StackedLoss(LossModule):
         super().__init__()
         losses = list(losses)
         names = [str(i) for i in range(len(losses))] if names is None else list(names)
-        _check_members(losses, names)
+        check_members(losses, names)
         self.names = names
         self.deactivate_vmap = deactivate_vmap
-        # Outside _modules: their own parameters are no state of the stack.
+        # Outside _modules: their own parameters are not state of the stack.
         self.__dict__["_losses"] = losses
         for loss in losses:
             for network in (loss, *(x for x in vars(loss).values() if isinstance(x, nn.Module))):
                 note_copied(network, type(self).__name__)
         template = deepcopy(losses[0])
-        own = [_state(loss) for loss in losses]
+        own = [state_of(loss) for loss in losses]
         self._paths: dict[str, str] = {}
         for path in own[0]:
             values = [state[path] for state in own]
             nested = "." in path or isinstance(values[0], Tensor)
             coefficient = path in getattr(template, "_coefficients", ())
-            if nested and not coefficient and not _trained(values[0]) and _equal(values):
-                continue  # alike in all members: the template's will do
+            if nested and not coefficient and not is_trained(values[0]) and are_equal(values):
+                continue  # equal in all members: the template's is used
             if isinstance(template.get_submodule(path.rpartition(".")[0]), nn.ModuleList):
                 raise BMRLError(f"{path!r} differs between the losses; valid: equal ones")
             name = path.replace(".", "_")
@@ -108,39 +129,39 @@ class StackedLoss(LossModule):
             if isinstance(values[0], Tensor):
                 self.register_buffer(name, torch.stack(values))
             else:
-                setattr(self, name, _stack(values))
+                setattr(self, name, stack_params(values))
         self.__dict__["_template"] = template
-        # SoftUpdate and HardUpdate note here what they move.
+        # SoftUpdate and HardUpdate record here what they update.
         self._has_update_associated = {
             name.removesuffix("_params"): False for name in self._paths if name.endswith("_params")
         }
 
-    # -- what the members have in common ---------------------------------------------------------
+    # -- attributes of all members ---------------------------------------------------------------
+
+    in_keys = _of_members("in_keys", "Keys that a member reads.")
+    out_keys = _of_members("out_keys", "Keys that ``forward`` returns, in order.")
+    tensor_keys = _of_members("tensor_keys", "Names of the entries, see the members' class.")
+    loss_mask_key = _of_members("loss_mask_key", "Key of the mask of the rows that count.")
+    value_type = _of_members("value_type", "Kind of the members' value estimator.")
+    vmap_randomness = _of_members("vmap_randomness", "How members draw in networks under vmap.")
+    deterministic_sampling_mode = _of_members(
+        "deterministic_sampling_mode", "Exploration type under which the members run."
+    )
 
     @property
-    def in_keys(self) -> list[Any]:
-        """Keys that a member reads."""
-        return self._template.in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[Any]) -> None:
-        for loss in self._all():
-            loss.in_keys = values
+    def value_estimator(self) -> Any:
+        """The members' estimator."""
+        return self._template.value_estimator
 
     @property
-    def out_keys(self) -> list[str]:
-        """Keys that ``forward`` returns, in order."""
-        return self._template.out_keys
+    def _value_estimator(self) -> Any:
+        template = self.__dict__.get("_template")
+        return None if template is None else template._value_estimator
 
-    @out_keys.setter
-    def out_keys(self, values: list[str]) -> None:
-        for loss in self._all():
-            loss.out_keys = values
-
-    @property
-    def tensor_keys(self) -> Any:
-        """Names of the entries, see the members' class."""
-        return self._template.tensor_keys
+    @_value_estimator.setter
+    def _value_estimator(self, value: Any) -> None:
+        if "_template" in self.__dict__:
+            self._template._value_estimator = value
 
     def set_keys(self, **kwargs: Any) -> None:
         """Renames entries for all members.
@@ -150,6 +171,15 @@ class StackedLoss(LossModule):
         """
         for loss in self._all():
             loss.set_keys(**kwargs)
+
+    def set_vmap_randomness(self, value: str) -> None:
+        """Sets how the members draw in critics or teachers under vmap.
+
+        Args:
+            value: ``"error"``, ``"same"`` or ``"different"``.
+        """
+        for loss in self._all():
+            loss.set_vmap_randomness(value)
 
     def make_value_estimator(self: Self, value_type: Any = None, **hyperparams: Any) -> Self:
         """Chooses the estimator of the critics' target for all members; returns the stack itself.
@@ -164,78 +194,18 @@ class StackedLoss(LossModule):
         return self
 
     def _drop_estimators(self) -> None:
-        """Forgets what the members' estimators had of their own: they are alike now."""
+        """Removes the stacked buffers of the members' estimators, which are now equal."""
         for name, path in list(self._paths.items()):
             if path.startswith("_value_estimator."):
                 del self._paths[name]
                 delattr(self, name)
-
-    @property
-    def value_estimator(self) -> Any:
-        """The members' estimator."""
-        return self._template.value_estimator
-
-    @property
-    def loss_mask_key(self) -> Any:
-        """Which entry marks the rows that count, see TorchRL's ``LossModule.loss_mask_key``."""
-        return self._template.loss_mask_key
-
-    @loss_mask_key.setter
-    def loss_mask_key(self, value: Any) -> None:
-        for loss in self._all():
-            loss.loss_mask_key = value
-
-    def set_vmap_randomness(self, value: str) -> None:
-        """Sets how the members draw where they run critics or teachers under vmap.
-
-        Args:
-            value: ``"error"``, ``"same"`` or ``"different"``.
-        """
-        for loss in self._all():
-            loss.set_vmap_randomness(value)
-
-    @property
-    def vmap_randomness(self) -> str:
-        """How the members draw where they run critics or teachers under vmap."""
-        return self._template.vmap_randomness
-
-    @property
-    def value_type(self) -> Any:
-        """Kind of the members' estimator."""
-        template = self.__dict__.get("_template")
-        return None if template is None else template.value_type
-
-    @value_type.setter
-    def value_type(self, value: Any) -> None:
-        for loss in self._all() if "_template" in self.__dict__ else ():
-            loss.value_type = value
-
-    @property
-    def _value_estimator(self) -> Any:
-        template = self.__dict__.get("_template")
-        return None if template is None else template._value_estimator
-
-    @_value_estimator.setter
-    def _value_estimator(self, value: Any) -> None:
-        if "_template" in self.__dict__:
-            self._template._value_estimator = value
-
-    @property
-    def deterministic_sampling_mode(self) -> Any:
-        """Exploration type under which the members run."""
-        return self._template.deterministic_sampling_mode
-
-    @deterministic_sampling_mode.setter
-    def deterministic_sampling_mode(self, value: Any) -> None:
-        for loss in self._all():
-            loss.deterministic_sampling_mode = value
 
     def reset_parameters_recursive(self) -> None:
         """Initialises the parameters of every member anew."""
         for index in range(len(self)):
             loss = self.member(index)
             loss.reset_parameters_recursive()
-            own = _state(loss)
+            own = state_of(loss)
             with torch.no_grad():
                 for name, path in self._paths.items():
                     self._held(name)[index].copy_(own[path])
@@ -257,12 +227,12 @@ class StackedLoss(LossModule):
                 raise BMRLError(f"{name} has {len(each)} numbers; valid: {len(self)}, or one")
         for loss, own in zip(self._all(), [each[0], *each], strict=True):
             setattr(loss, name, own)
-        # A coefficient that was None had no buffer, and one that is None has none.
+        # A coefficient that is None has no buffer.
         self._paths.pop(name, None)
         self._buffers.pop(name, None)
         if value is not None:
             self._paths[name] = name
-            # Not by register_buffer, which finds the members' under this name.
+            # Not register_buffer, which would find the members' attribute of this name.
             own = torch.stack([getattr(x, name) for x in self._losses])
             self._buffers[name] = own.to(getattr(template, name))
 
@@ -285,18 +255,18 @@ class StackedLoss(LossModule):
         return super()._apply(fn)
 
     def member(self, index: int) -> LossModule:
-        """One of the losses that the stack was made of, with its present parameters.
+        """One of the given losses, with its present parameters.
 
         Args:
             index: its position.
 
         Returns:
-            the loss itself; later updates of the stack do not reach it until it is asked for again.
+            the loss itself; later updates of the stack reach it at the next call of this method.
         """
         loss = self._losses[index]
         reference = next(self.parameters())
         loss.to(dtype=reference.dtype, device=reference.device)
-        own = _state(loss)
+        own = state_of(loss)
         with torch.no_grad():
             for name, path in self._paths.items():
                 own[path].copy_(self._held(name)[index])
@@ -342,11 +312,11 @@ class StackedLoss(LossModule):
             for row, data in zip(rows, tensordict.unbind(0), strict=True):
                 with self._holding(dict(zip(state, row, strict=True))) as loss:
                     results.append(function(loss, data))
-            return _join(results)
+            return join(results)
         shape = getattr(self._template, "batch_shape", lambda data: data.batch_size)
         valid = self._template.valid_rows(tensordict, shape(tensordict))
         for key in self.in_keys:
-            entry(tensordict, key, valid)  # under vmap no member can look for itself
+            entry(tensordict, key, valid)  # under vmap a member cannot check it
 
         def run(state: dict[str, Any], data: TensorDictBase) -> Any:
             with self._holding(state) as loss:
@@ -356,11 +326,11 @@ class StackedLoss(LossModule):
 
     def _held(self, name: str) -> TensorDictBase | Tensor:
         value = getattr(self, name)
-        return getattr(value, "_param_td", value)  # which does not wrap each of its methods
+        return getattr(value, "_param_td", value)  # TensorDictParams wraps each of its methods
 
     @property
     def in_sequence(self) -> bool:
-        """Whether the members run one after the other; only TD(0) has a program under vmap."""
+        """Whether the members run one after the other; only TD(0) runs under vmap."""
         estimator = self._template._value_estimator
         if estimator is not None and not isinstance(estimator, TD0Estimator):
             return True
@@ -377,7 +347,7 @@ class StackedLoss(LossModule):
                 parent, _, attribute = self._paths[name].rpartition(".")
                 owner = template.get_submodule(parent)
                 held.append((owner, attribute))
-                # Found before the module's own, which stay where they are.
+                # Python finds these before the module's own, which stay in place.
                 owner.__dict__[attribute] = value
             yield template
         finally:
@@ -386,80 +356,7 @@ class StackedLoss(LossModule):
 
 
 def _passed_on(template: LossModule, name: str) -> bool:
-    """Whether a stack has what its members have: coefficients, options and networks."""
+    """Whether an attribute is one of the members: a coefficient, an option or a network."""
     if name == "gamma" or name in getattr(template, "_coefficients", ()):
         return hasattr(template, name)
     return name in vars(template) and not name.startswith("_") and name != "training"
-
-
-def _state(loss: LossModule) -> dict[str, Any]:
-    """Parameters and buffers of a loss by where they lie: TensorDicts, and tensors outside them."""
-    state: dict[str, Any] = {}
-    for path, module in loss.named_modules():
-        if isinstance(module, TensorDictParams):
-            state[path] = module._param_td
-        else:
-            prefix = f"{path}." if path else ""
-            buffers = module.named_buffers(recurse=False)
-            state |= {f"{prefix}{name}": buffer for name, buffer in buffers}
-    return state
-
-
-def _leaves(value: Any) -> list[Tensor]:
-    return [value] if isinstance(value, Tensor) else list(value.values(True, True))
-
-
-def _trained(value: Any) -> bool:
-    return any(leaf.requires_grad for leaf in _leaves(value))
-
-
-def _equal(values: Sequence[Any]) -> bool:
-    first, *others = map(_leaves, values)
-    return all(all(map(torch.equal, first, other)) for other in others)
-
-
-def _stack(values: Sequence[TensorDictBase]) -> TensorDictParams:
-    """One TensorDictParams over a new first dimension; parameters stay such, buffers too."""
-    stacked: Any = torch.stack([value.data for value in values]).contiguous()
-    for key, leaf in values[0].items(True, True):
-        if leaf.requires_grad:
-            stacked.set(key, nn.Parameter(stacked.get(key)))
-        elif isinstance(leaf, nn.Buffer):
-            stacked.set(key, nn.Buffer(stacked.get(key)))
-    return TensorDictParams(stacked, no_convert="skip")
-
-
-def _join(results: Sequence[Any]) -> Any:
-    """Stacks what the members returned: tensors, in tuples and dicts."""
-    first = results[0]
-    if isinstance(first, Tensor):
-        return torch.stack(list(results))
-    if isinstance(first, dict):
-        return {key: _join([result[key] for result in results]) for key in first}
-    if isinstance(first, tuple):
-        return tuple(map(_join, zip(*results, strict=True)))
-    return first
-
-
-def _kind(loss: LossModule) -> tuple[Any, ...]:
-    """What members of a stack have in common."""
-    return type(loss), kind(loss), loss.tensor_keys, loss.in_keys, loss.loss_mask_key
-
-
-def _check_members(losses: Sequence[LossModule], names: Sequence[str]) -> None:
-    if not losses or len(names) != len(losses) or len(set(names)) < len(names):
-        raise BMRLError(
-            f"{len(losses)} losses named {list(names)}; valid: at least one, each with its own name"
-        )
-    if any(map(is_lazy, losses)):
-        raise BMRLError("a loss has parameters without a shape; valid: losses that have run once")
-    for name, loss in zip(names, losses, strict=True):
-        if _kind(loss) != _kind(losses[0]):
-            raise BMRLError(
-                f"loss {name!r} differs from {names[0]!r} in kind, keys, networks or options; "
-                "valid: equal ones, but for parameters and coefficients"
-            )
-    held = [leaf for loss in losses for part in _state(loss).values() for leaf in _leaves(part)]
-    trained = [id(leaf) for leaf in held if leaf.requires_grad]
-    if len(set(trained)) < len(trained):
-        raise BMRLError("networks of the losses share parameters; valid: each network has its own")

@@ -1,27 +1,33 @@
-"""Running a module with other parameters than its own."""
+"""Running networks with parameters that are not their own."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 from weakref import WeakKeyDictionary
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+
+from torchrl_bmrl.errors import BMRLError
+
+Weights: TypeAlias = TensorDictBase | list[Tensor]
+"""Parameters and buffers of a module: as ``TensorDict.from_module`` has them, or a flat list."""
 
 _PATHS: WeakKeyDictionary[nn.Module, list[tuple[str, ...]]] = WeakKeyDictionary()
 _SLOTS: WeakKeyDictionary[nn.Module, list[tuple[dict[str, Tensor], str]]] = WeakKeyDictionary()
 
 
 @contextmanager
-def holding(module: nn.Module, params: TensorDictBase | list[Tensor]) -> Iterator[None]:
-    """Puts parameters and buffers into a module for a while.
+def holding(module: nn.Module, params: Weights) -> Iterator[None]:
+    """Puts parameters and buffers into a module inside a ``with`` block.
 
-    It is ``params.to_module(module)`` without the bookkeeping that makes a tenth of a small update
-    in eager mode; a compiled loss uses tensordict's own.
+    It is ``params.to_module(module)`` without its bookkeeping, which takes a tenth of a small
+    update in eager mode; a compiled loss uses tensordict's own.
 
     Args:
         module: the module.
@@ -51,23 +57,42 @@ def holding(module: nn.Module, params: TensorDictBase | list[Tensor]) -> Iterato
 
 
 def leaves(params: TensorDictBase, module: nn.Module) -> list[Tensor]:
-    """Parameters and buffers in the order of a module's own.
+    """Parameters and buffers in the order in which the module lists its own.
 
     Args:
         params: in the layout of ``TensorDict.from_module(module)``.
-        module: into which they belong.
+        module: the module.
     """
-    # TensorDictParams wraps each of its own methods; what it holds does not.
+    # TensorDictParams wraps each of its own methods; the TensorDict inside does not.
     params = getattr(params, "_param_td", params)
     found = []
-    for path in _paths(module):
+    _slots(module)
+    for path in _PATHS[module]:
         value: Any = params
         for part in path:
-            # Where a plain TensorDict keeps it, which get() takes long for.
+            # A plain TensorDict's own dictionary: get() is slow.
             held = getattr(value, "_tensordict", None)
             value = value.get(part) if held is None else held[part]
         found.append(value)
     return found
+
+
+def unbound(weights: Weights) -> Iterable[Any]:
+    """The parameters of each member, of parameters that are stacked along a first dimension."""
+    if isinstance(weights, list):
+        return map(list, zip(*(leaf.unbind(0) for leaf in weights), strict=True))
+    return weights.unbind(0)
+
+
+def shared_keys(loss: nn.Module) -> dict[str, list[NestedKey]]:
+    """By network of a loss, the keys of the parameters that it shares with the generator."""
+    generator = loss._modules.get("generator_params")
+    own = set() if generator is None else {id(p) for p in generator.parameters()}
+    return {
+        name: [key for key, value in params.items(True, True) if id(value) in own]
+        for name, params in loss.named_children()
+        if isinstance(params, TensorDictParams) and name != "generator_params"
+    }
 
 
 def without_gradient(params: TensorDictBase, keys: Sequence[NestedKey]) -> TensorDictBase:
@@ -76,19 +101,56 @@ def without_gradient(params: TensorDictBase, keys: Sequence[NestedKey]) -> Tenso
     return copy.update({key: params[key].detach() for key in keys})
 
 
+def read(module: TensorDictModule, tensordict: TensorDictBase) -> TensorDictBase:
+    """Runs a network on the data.
+
+    Raises:
+        BMRLError: naming what it reads, with the shapes, if the data do not fit.
+    """
+    if torch.compiler.is_compiling():
+        return module(tensordict)
+    try:
+        return module(tensordict)
+    except torch.OutOfMemoryError:
+        raise
+    except (RuntimeError, KeyError) as error:
+        raise unfit(module, tensordict, error) from error
+
+
+def unfit(
+    module: Any, tensordict: TensorDictBase, error: Exception, also: Sequence[NestedKey] = ()
+) -> BMRLError:
+    """The error for data that a network cannot read.
+
+    Args:
+        module: the network.
+        tensordict: the data.
+        error: that it raised.
+        also: keys that it reads beside its ``in_keys``.
+    """
+    keys = dict.fromkeys([*module.in_keys, *also])
+    entries = [(key, tensordict.get(key, None)) for key in keys]
+    seen = ", ".join(
+        f"{key!r} {'missing' if x is None else f'{tuple(x.shape)} {x.dtype}'}" for key, x in entries
+    )
+    types = {x.dtype for _, x in entries if x is not None and x.is_floating_point()}
+    weight = next(module.parameters(), None)
+    other = weight is not None and bool(types) and types != {weight.dtype}
+    return BMRLError(
+        f"a network cannot read {seen} ({error}); valid: the sizes and types that it was made for"
+        + other
+        * f". Its parameters are {getattr(weight, 'dtype', '')}: convert the data, as "
+        "torchrl.envs.transforms.DoubleToFloat does, or the loss, as loss.double() does"
+    )
+
+
 def _fill(slots: Sequence[tuple[dict[str, Tensor], str]], values: Sequence[Tensor]) -> None:
     for (owner, name), value in zip(slots, values, strict=True):
         owner[name] = value
 
 
-def _paths(module: nn.Module) -> list[tuple[str, ...]]:
-    """Where a module's parameters and buffers lie in its tensordict."""
-    _slots(module)
-    return _PATHS[module]
-
-
 def _slots(module: nn.Module) -> list[tuple[dict[str, Tensor], str]]:
-    """Where a module keeps its parameters and buffers, in the order of its tensordict."""
+    """Dictionaries and names of a module's parameters and buffers, in its tensordict's order."""
     known = _SLOTS.get(module)
     if known is None:
         known, paths = [], []

@@ -1,0 +1,60 @@
+"""Random rows of a batch ``[num_tasks, B]``: of the same task, and of other tasks."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def draw_rows(task_latent: Tensor, valid: Tensor | None, number: int) -> Tensor:
+    """For each row the m of some random rows of its task, ``(num_tasks, B, number, m)``.
+
+    Args:
+        task_latent: m, ``(num_tasks, B, m)``.
+        valid: which rows count, ``(num_tasks, B)``; ``None`` if all do.
+        number: of rows to draw.
+
+    Example:
+        >>> draw_rows(torch.zeros(3, 5, 2), None, 8).shape
+        torch.Size([3, 5, 8, 2])
+    """
+    num_tasks, rows, size = task_latent.shape
+    if valid is None:
+        return task_latent[:, torch.randint(rows, (rows, number), device=task_latent.device)]
+    # The valid rows come first. A task without any draws its first row, which counts nowhere.
+    order = (~valid).to(torch.uint8).argsort(dim=-1, stable=True)
+    count = valid.sum(-1, keepdim=True).clamp(min=1)
+    share = torch.rand(num_tasks, rows * number, device=task_latent.device)
+    index = order.gather(1, (share * count).long().clamp(max=rows - 1))
+    chosen = task_latent.gather(1, index.unsqueeze(-1).expand(-1, -1, size))
+    return chosen.view(num_tasks, rows, number, size)
+
+
+def draw_others(task_latent: Tensor, valid: Tensor | None) -> tuple[Tensor, Tensor]:
+    """For each row the m of another row of its task and of a row of another task.
+
+    Args:
+        task_latent: m, ``(num_tasks, B, m)``.
+        valid: which rows count, ``(num_tasks, B)``; ``None`` if all do.
+
+    Returns:
+        two tensors ``(num_tasks, B, m)``.
+
+    Example:
+        >>> near, far = draw_others(torch.arange(6.0).view(2, 3, 1), None)
+        >>> bool((near[0] < 3).all()), bool((far[0] >= 3).all())
+        (True, True)
+    """
+    num_tasks, rows = task_latent.shape[:2]
+    device = task_latent.device
+    # A cyclic shift by 1 to n - 1 never draws the row, or the task, itself.
+    if valid is None:
+        shift = torch.randint(1, max(rows, 2), (rows,), device=device)
+        near = task_latent[:, (torch.arange(rows, device=device) + shift) % rows]
+        far = task_latent
+    else:
+        near, far = (draw_rows(task_latent, valid, 1).squeeze(2) for _ in range(2))
+    shift = torch.randint(1, num_tasks, (num_tasks, rows), device=device)
+    task = (torch.arange(num_tasks, device=device).unsqueeze(-1) + shift) % num_tasks
+    row = torch.randint(rows, (num_tasks, rows), device=device)
+    return near, far[task, row]
