@@ -117,7 +117,7 @@ def with_folders_settings(config: DictConfig) -> DictConfig:
     if not given.get("run_dir") or not (run_dir / "config.yaml").exists():
         return config
     theirs = read_settings(run_dir)
-    mine = OmegaConf.to_container(config, resolve=True)
+    mine: Any = OmegaConf.to_container(config, resolve=True)
     for name in NAMES:
         if name in given and mine[name] != theirs.get(name):
             if deciding(mine) == deciding(theirs):
@@ -157,8 +157,8 @@ def _given(config: DictConfig) -> Mapping[str, Any]:
     overrides = OverridesParser.create().parse_overrides(lines)
     given = dict(flat({override.key_or_group: override.value() for override in overrides}))
     # Hydra keeps the overrides of its last command; this configuration may be made in code.
-    own = OmegaConf.to_container(config, resolve=False)["run_dir"] == given.get("run_dir")
-    return given if own else {}
+    own: Any = OmegaConf.to_container(config, resolve=False)
+    return given if own["run_dir"] == given.get("run_dir") else {}
 
 
 OmegaConf.register_new_resolver(

@@ -32,7 +32,7 @@ from torchrl.modules import MLP
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.functional import triplet_error
 from torchrl_bmrl.modules import PLASPolicy, make_decoder, make_qvalue_network
-from torchrl_bmrl.objectives import MetaDistillationLoss, distillation
+from torchrl_bmrl.objectives import MetaDistillationLoss
 from torchrl_bmrl.objectives.task_rows import draw_others
 
 Teachers = tuple[list[TensorDictModule], list[TensorDictModule]]
@@ -197,7 +197,7 @@ def test_metric_term_is_the_triplet_error_of_rows_of_the_same_and_another_task(
         calls.append(inputs)
         return triplet_error(*inputs)
 
-    monkeypatch.setattr(functional, "triplet_error", spy)
+    monkeypatch.setattr("torchrl_bmrl.functional.triplet_error", spy)
     loss = make_distillation_loss(metric_weight=0.5, metric_margin=0.3, reduction="none")
     data = task_transitions(TASKS, 20)
     value = run(loss, data)["loss_metric"].detach().numpy()

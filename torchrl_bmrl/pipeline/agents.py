@@ -306,7 +306,8 @@ def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
         ['lift']
     """
     state, metadata = load_checkpoint(path, kind="student")
-    student = build(Student, _with_sizes(metadata.get("student")), state, path)
+    metadata["student"] = _with_sizes(metadata.get("student"))
+    student = build(Student, metadata["student"], state, path)
     number = len(student.prototypes)
     valid: dict[str, tuple[Callable[[Any], bool], str]] = {
         "tasks": (

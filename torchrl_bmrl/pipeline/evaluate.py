@@ -192,7 +192,9 @@ def embed(run: Run, split: str) -> tuple[Embeddings, float]:
     with torch.random.fork_rng([]):
         torch.manual_seed(run.seed("untrained encoder"))
         untrained = Student(**metadata["student"])
-    parts, distances, successes, phases, phase_names = [], [], [], [], {}
+    parts: list[Any] = []
+    distances, successes, phases = [], [], []
+    phase_names: dict[str, tuple[str, ...]] = {}
     for index, task in enumerate(run.tasks):
         path = run.demonstrations(task.name)
         parts.append(run.transitions(task.name, split))
@@ -202,7 +204,7 @@ def embed(run: Run, split: str) -> tuple[Embeddings, float]:
         phase, names = read_phases(path, split=split)
         phases.append(phase.numpy())
         phase_names |= {task.name: names} if names else {}
-    data = torch.cat(parts)
+    data: TensorDictBase = torch.cat(parts)  # type: ignore[assignment]
     embeddings = Embeddings(
         task_latent=student.embed(data).numpy(),
         task=data["task"].numpy(),

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import warnings
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -17,7 +19,7 @@ from torchrl_bmrl.run.workers import Report
 
 log = logging.getLogger(__name__)
 
-COLUMNS = {
+COLUMNS: dict[str, Callable[[str], Any]] = {
     "task": str,
     "loss_generator": finite,
     "loss_qvalue": finite,
@@ -69,7 +71,7 @@ def evaluate_held_out(run: Run) -> Table:
         ),
         rows=[
             (
-                run.titles[row["task"]],
+                run.titles[str(row["task"])],
                 *(f"{row[key]:.4g}" for key in ("loss_generator", "loss_qvalue", "distance")),
                 f"{row['accuracy']:.1%}",
                 *(f"{row[key]:.2f}" for key in ("demonstrated", "bcq", "distilled")),
@@ -106,7 +108,7 @@ def held_out_job(job: tuple[Run, str], report: Report) -> dict[str, str | float]
         for each, data in ((teacher, valid), (policy, told(valid)))
     ]
     train, settings = run.transitions(name, "train"), run.settings
-    options = {
+    options: dict[str, Any] = {
         "updates": settings.evaluate.fqe_updates,
         "gamma": settings.bcq.gamma,
         "num_cells": settings.bcq.num_cells,

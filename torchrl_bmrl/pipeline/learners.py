@@ -66,7 +66,7 @@ def make_update(
     """One update of every network that has an optimizer, in their order, then of the targets."""
 
     def update(batch: TensorDictBase) -> dict[str, Tensor]:
-        metrics = {}
+        metrics: dict[str, Tensor] = {}
         for network, optimizer in optimizers.items():
             value, info = getattr(loss, f"{network}_loss")(batch)
             gradient_step(optimizer, value, max_norm if network == "qvalue" else None)
@@ -202,8 +202,14 @@ class Agents:
             metadata = {"kind": self.kind, "names": self.names, "updates": update}
             metadata |= {"evaluations": self.evaluations, "diverged": self.diverged}
             metadata["settings"] = self.run.settings.deciding()
-        options = {"device": self.device, "keep": self.run.settings.keep_checkpoints}
-        keep_training(self.path, self.loss, self.optimizers, metadata, **options)
+        keep_training(
+            self.path,
+            self.loss,
+            self.optimizers,
+            metadata,
+            device=self.device,
+            keep=self.run.settings.keep_checkpoints,
+        )
         if self.kind != "bcq":
             for name in self.well:
                 self.save_agent(name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from contextlib import ExitStack
 from statistics import fmean
+from typing import Any
 
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -61,7 +62,10 @@ def train_job(job: tuple[Run, dict[str, str]], report: Report) -> None:
     """
     run, agents = job
     datasets = [run.transitions(task, "train") for task in agents.values()]
-    options = {"batch_size": run.settings.bcq.batch_size, "device": run.settings.device}
+    options: dict[str, Any] = {
+        "batch_size": run.settings.bcq.batch_size,
+        "device": run.settings.device,
+    }
     if len(agents) == 1:
         buffer = make_replay_buffer(datasets[0], **options)
     else:

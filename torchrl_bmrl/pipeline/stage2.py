@@ -133,7 +133,7 @@ def train_student(job: tuple[Run, None], report: Report) -> None:
         gradient_step(optimizer, total)
         return {name: value.detach() for name, value in losses.items()}
 
-    update = accelerate(
+    accelerated = accelerate(
         update,
         compiled=settings.compile,
         captured=settings.cudagraphs,
@@ -145,7 +145,7 @@ def train_student(job: tuple[Run, None], report: Report) -> None:
             share = (number - 1) / distill.updates
             rate = distill.lr * (1 + math.cos(math.pi * share)) / 2
             optimizer.param_groups[0]["lr"].fill_(rate)
-        return update(batch.select(*loss.in_keys))
+        return accelerated(batch.select(*loss.in_keys))
 
     def check(
         number: int, metrics: dict[str, Tensor], batch: TensorDictBase, logging: bool
@@ -160,19 +160,25 @@ def train_student(job: tuple[Run, None], report: Report) -> None:
     def save(number: int) -> None:
         own = student if settings.device == "cpu" else deepcopy(student).to("cpu")
         own.set_prototypes(train, distill.prototype)
+        accuracy = own.accuracy(torch.cat(valid))
         metadata = {
             "kind": "student",
             "tasks": list(run.names),
             "student": options,
             "latent_clip": teachers[0].latent_clip,
             "updates": number,
-            "accuracy": own.accuracy(torch.cat(valid)),
+            "accuracy": accuracy,
             "settings": settings.deciding(),
             "statistics": run.statistics.to_lists(),
         }
-        keeping = {"device": settings.device, "keep": settings.keep_checkpoints}
-        keep_training(path, own, {"student": optimizer}, metadata, **keeping)
-        accuracy = metadata["accuracy"]
+        keep_training(
+            path,
+            own,
+            {"student": optimizer},
+            metadata,
+            device=settings.device,
+            keep=settings.keep_checkpoints,
+        )
         log.debug("distillation: update %d saved, accuracy %.1f%%", number, 100 * accuracy)
 
     with ExitStack() as stack:

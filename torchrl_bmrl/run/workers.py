@@ -166,9 +166,13 @@ class _Worker:
 class _SendRecords(logging.handlers.QueueHandler):
     """Sends a worker's log records to the process that started it."""
 
+    def __init__(self, connection: Connection) -> None:
+        super().__init__(None)  # type: ignore[arg-type]  # there is no queue
+        self.connection = connection
+
     def enqueue(self, record: logging.LogRecord) -> None:
         with suppress(OSError):
-            self.queue.send(("log", record))
+            self.connection.send(("log", record))
 
 
 def _serve(connection: Connection, function: Callable[[Job, Report], Result], level: int) -> None:
