@@ -1,25 +1,28 @@
-"""One control period of robosuite in one call into compiled code, the same bits as its own.
+"""One control period of robosuite in one call into compiled code, equal to robosuite's to the bit.
 
 robosuite computes the torques of operational-space control in Python, 25 times per action, which
-takes three quarters of a step. :class:`FastStepper` runs the 25 physics substeps in one compiled
-loop on MuJoCo's own arrays. robosuite remains the definition: it builds the model, sets the goal of
-each action, and its own functions (``opspace_matrices``, ``nullspace_torques``,
-``orientation_error``) are called in the loop. What robosuite does in plain numpy is done there in
-the same order, matrix products by numpy itself: another order of additions differs in the last bit,
-and a contact makes centimetres of it within a second.
+takes three quarters of a step. :class:`FastStepper` runs the physics substeps and the controller in
+one compiled loop on MuJoCo's own arrays. It works for any single arm on a fixed base and does not
+know a task or a robot by name.
+
+robosuite remains the definition. It builds the model and sets the goal of each action, and the loop
+calls its compiled functions (``opspace_matrices``, ``nullspace_torques``, ``orientation_error``).
+Where robosuite uses plain numpy, the loop does the same operations in the same order and calls
+numpy for matrix products: a different order of additions changes the last bit, and contacts turn
+that into centimetres within a second.
 """
 
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from torchrl_bmrl.envs.caching import cached_njit
 from torchrl_bmrl.envs.physics import mujoco_library
-from torchrl_bmrl.envs.scene import TabletopScene
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.extras import needs
 
@@ -45,48 +48,62 @@ _library = mujoco_library(Path(mujoco.__file__).parent, mujoco.__version__, sys.
 if isinstance(_library, Path):
     binding.load_library_permanently(str(_library))
 _address = types.uintp
+_mj_step = types.ExternalFunction("mj_step", types.void(_address, _address))
 _mj_step1 = types.ExternalFunction("mj_step1", types.void(_address, _address))
 _mj_step2 = types.ExternalFunction("mj_step2", types.void(_address, _address))
+_mj_forward = types.ExternalFunction("mj_forward", types.void(_address, _address))
 _mj_jac_site = types.ExternalFunction("mj_jacSite", types.void(*[_address] * 4, types.int32))
 _mj_full_m = types.ExternalFunction("mj_fullM", types.void(*[_address] * 3))
-_mj_fwd_position = types.ExternalFunction("mj_fwdPosition", types.void(_address, _address))
 _py_call = types.ExternalFunction("PyObject_Call", _address(*[_address] * 3))
 _py_decref = types.ExternalFunction("Py_DecRef", types.void(_address))
 
 
 class _Robot(NamedTuple):
-    """What stays the same from step to step: views of MuJoCo's arrays, indices, limits."""
+    """What stays the same from step to step: views of MuJoCo's arrays, indices, settings."""
 
     model: int  # address
     data: int  # address
     dot: int  # address of np.dot
+    lite: bool  # physics in two halves, robosuite's default
+    arm_lite: bool  # the controller does not evaluate the physics again
     site: int  # end-effector
     dof: int  # first of the arm's in qvel
     joint: int  # first of the arm's in qpos
     actuator: int  # first of the arm's in ctrl
+    fingers: np.ndarray  # the gripper's in ctrl
     qpos: np.ndarray
     qvel: np.ndarray
     bias: np.ndarray
     inertia: np.ndarray
     ctrl: np.ndarray
-    position: np.ndarray
-    rotation: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    limits: np.ndarray  # (nu, 2), of ctrl
+    site_position: np.ndarray
+    site_rotation: np.ndarray
+
+
+class _Arm(NamedTuple):
+    """The arm as its controller saw it last; all but the first five are the controller's own."""
+
+    mass: np.ndarray  # (n, n)
+    joint_position: np.ndarray  # (n,)
+    joint_velocity: np.ndarray  # (n,)
+    torque: np.ndarray  # (n,), before it is clipped
+    coordinates: np.ndarray  # (nq + nv,), of all joints
+    position: np.ndarray  # (3,)
+    rotation: np.ndarray  # (3, 3)
+    velocity: np.ndarray  # (3,)
+    angular_velocity: np.ndarray  # (3,)
+    jacobian_position: np.ndarray  # (3, n)
+    jacobian_rotation: np.ndarray  # (3, n)
+    jacobian: np.ndarray  # (6, n)
 
 
 class _Scratch(NamedTuple):
-    """Room for the results of each substep, with robosuite's shapes and memory layouts."""
+    """Buffers of each substep, with robosuite's shapes and memory layouts."""
 
     jacobian_position: np.ndarray  # (3, nv)
     jacobian_rotation: np.ndarray  # (3, nv)
-    full_mass: np.ndarray  # (nv, nv)
-    mass: np.ndarray  # (n, n)
-    arm_position: np.ndarray  # (3, n)
-    arm_rotation: np.ndarray  # (3, n)
-    arm_jacobian: np.ndarray  # (6, n)
-    velocity: np.ndarray  # (3,)
-    angular_velocity: np.ndarray  # (3,)
+    mass: np.ndarray  # (nv, nv)
     lambda_position: np.ndarray  # (3, 3)
     lambda_rotation: np.ndarray  # (3, 3)
     force: np.ndarray  # (3,)
@@ -105,13 +122,14 @@ class _Products(NamedTuple):
 
 
 class _Goal(NamedTuple):
-    """Where the arm is to go, and how stiffly."""
+    """Where the arm is to go, how stiffly, and what the gripper is to do."""
 
     position: np.ndarray  # (3,) [m], world
     rotation: np.ndarray  # (3, 3), world
     kp: np.ndarray  # (6,)
     kd: np.ndarray  # (6,)
     rest: np.ndarray  # (n,) [rad], of the null space
+    fingers: np.ndarray  # controls of the gripper
 
 
 @cached_njit
@@ -121,43 +139,69 @@ def _numpy_dot(dot: int, arguments: int) -> None:
 
 
 @cached_njit
-def _control_period(
-    substeps: int, robot: _Robot, scratch: _Scratch, products: _Products, goal: _Goal
+def _clipped(value: float, low: float, high: float) -> float:
+    # As np.clip: NaN stays NaN, which MuJoCo reports.
+    value = low if value < low else value
+    return high if value > high else value
+
+
+@cached_njit
+def _run(
+    substeps: int,
+    evaluated: bool,
+    seen: bool,
+    robot: _Robot,
+    arm: _Arm,
+    scratch: _Scratch,
+    products: _Products,
+    goal: _Goal,
 ) -> None:
     """``OperationalSpaceController.run_controller`` and the physics, ``substeps`` times.
 
-    The first ``mj_step1`` has been made by the caller, who needed the poses to set the goal.
+    The caller has ``evaluated`` the first substep's positions where it needed them to set the goal.
+    ``seen``: the controller uses in the first substep what it has seen of the arm before, as it
+    does after a reset.
     """
-    n, first = len(robot.low), robot.dof
+    n, first, nq = len(arm.torque), robot.dof, len(robot.qpos)
     joints, dofs = slice(robot.joint, robot.joint + n), slice(first, first + n)
     for substep in range(substeps):
-        if substep:
-            _mj_step1(robot.model, robot.data)
-        _mj_jac_site(
-            robot.model,
-            robot.data,
-            scratch.jacobian_position.ctypes.data,
-            scratch.jacobian_rotation.ctypes.data,
-            robot.site,
-        )
-        _mj_full_m(robot.model, scratch.full_mass.ctypes.data, robot.inertia.ctypes.data)
-        _numpy_dot(robot.dot, products.velocity)
-        _numpy_dot(robot.dot, products.angular_velocity)
-        scratch.mass[:] = scratch.full_mass[dofs, dofs]
-        scratch.arm_position[:] = scratch.jacobian_position[:, dofs]
-        scratch.arm_rotation[:] = scratch.jacobian_rotation[:, dofs]
-        scratch.arm_jacobian[:3] = scratch.arm_position
-        scratch.arm_jacobian[3:] = scratch.arm_rotation
-        error = orientation_error(goal.rotation, robot.rotation)
+        if substep or not evaluated:
+            if robot.lite:
+                _mj_step1(robot.model, robot.data)
+            else:
+                _mj_forward(robot.model, robot.data)
+            if not robot.arm_lite:
+                _mj_forward(robot.model, robot.data)
+        if substep or not seen:
+            _mj_jac_site(
+                robot.model,
+                robot.data,
+                scratch.jacobian_position.ctypes.data,
+                scratch.jacobian_rotation.ctypes.data,
+                robot.site,
+            )
+            _mj_full_m(robot.model, scratch.mass.ctypes.data, robot.inertia.ctypes.data)
+            _numpy_dot(robot.dot, products.velocity)
+            _numpy_dot(robot.dot, products.angular_velocity)
+            arm.mass[:] = scratch.mass[dofs, dofs]
+            arm.position[:] = robot.site_position
+            arm.rotation[:] = robot.site_rotation
+            arm.jacobian_position[:] = scratch.jacobian_position[:, dofs]
+            arm.jacobian_rotation[:] = scratch.jacobian_rotation[:, dofs]
+            arm.jacobian[:3] = arm.jacobian_position
+            arm.jacobian[3:] = arm.jacobian_rotation
+            arm.joint_position[:] = robot.qpos[joints]
+            arm.joint_velocity[:] = robot.qvel[dofs]
+        error = orientation_error(goal.rotation, arm.rotation)
         for i in range(3):
-            scratch.force[i] = (goal.position[i] - robot.position[i]) * goal.kp[i] + (
-                -scratch.velocity[i]
+            scratch.force[i] = (goal.position[i] - arm.position[i]) * goal.kp[i] + (
+                -arm.velocity[i]
             ) * goal.kd[i]
             scratch.torque[i] = (
-                error[i] * goal.kp[i + 3] + (-scratch.angular_velocity[i]) * goal.kd[i + 3]
+                error[i] * goal.kp[i + 3] + (-arm.angular_velocity[i]) * goal.kd[i + 3]
             )
         _, lambda_position, lambda_rotation, nullspace = opspace_matrices(
-            scratch.mass, scratch.arm_jacobian, scratch.arm_position, scratch.arm_rotation
+            arm.mass, arm.jacobian, arm.jacobian_position, arm.jacobian_rotation
         )
         scratch.lambda_position[:] = lambda_position
         scratch.lambda_rotation[:] = lambda_rotation
@@ -165,163 +209,291 @@ def _control_period(
         _numpy_dot(robot.dot, products.torque)
         _numpy_dot(robot.dot, products.joint_torque)
         rest = nullspace_torques(
-            scratch.mass, nullspace, goal.rest, robot.qpos[joints], robot.qvel[dofs]
+            arm.mass, nullspace, goal.rest, arm.joint_position, arm.joint_velocity
         )
         for i in range(n):
-            torque = (scratch.joint_torque[i] + robot.bias[first + i]) + rest[i]
-            robot.ctrl[robot.actuator + i] = min(max(torque, robot.low[i]), robot.high[i])
-        _mj_step2(robot.model, robot.data)
-    # Poses lag the joints by one substep; the observation is a function of the state.
-    _mj_fwd_position(robot.model, robot.data)
+            arm.torque[i] = (scratch.joint_torque[i] + robot.bias[first + i]) + rest[i]
+            j = robot.actuator + i
+            robot.ctrl[j] = _clipped(arm.torque[i], robot.limits[j, 0], robot.limits[j, 1])
+        for i in range(len(robot.fingers)):
+            j = robot.fingers[i]
+            robot.ctrl[j] = _clipped(goal.fingers[i], robot.limits[j, 0], robot.limits[j, 1])
+        if substep == substeps - 1:
+            arm.coordinates[:nq] = robot.qpos
+            arm.coordinates[nq:] = robot.qvel
+        if robot.lite:
+            _mj_step2(robot.model, robot.data)
+        else:
+            _mj_step(robot.model, robot.data)
 
 
-def why_not_fast(env: TabletopScene) -> str | None:
-    """What keeps :class:`FastStepper` from standing in for ``env.step``, or ``None``.
+@dataclass(frozen=True)
+class Obstacle:
+    """Why an environment cannot step fast.
 
     Args:
-        env: robosuite environment, reset.
+        kind: one of ``library``, ``closed``, ``robots``, ``step``, ``viewer``, ``controller``,
+            ``arm``, ``gripper``, ``interpolation``, ``parts``, ``numba``, ``base``, ``joints``.
+        reason: a sentence for a person.
+
+    Example:
+        >>> print(Obstacle("base", "the arm's base moves"))
+        the arm's base moves
     """
+
+    kind: str
+    reason: str
+
+    def __str__(self) -> str:
+        return self.reason
+
+
+def why_not_fast(env: MujocoEnv) -> Obstacle | None:
+    """What keeps robosuite's environment from being stepped fast, or ``None``.
+
+    Args:
+        env: robosuite environment without wrappers.
+    """
+    return _settings_obstacle(env) or _model_obstacle(env)
+
+
+def _settings_obstacle(env: MujocoEnv) -> Obstacle | None:
+    """What may change between two steps."""
     if isinstance(_library, str):
-        return _library
-    robot = env.robots[0]
+        return Obstacle("library", _library)
+    if env.sim is None:
+        return Obstacle("closed", "the environment is closed")
+    kind, robots = type(env), getattr(env, "robots", ())
+    if len(robots) != 1 or type(robots[0]) is not FixedBaseRobot:
+        names = ", ".join(type(robot).__name__ for robot in robots)
+        return Obstacle("robots", f"robots are {names}; valid: one FixedBaseRobot")
+    own = vars(env)
+    for name, valid in _METHODS.items():
+        if name in own or getattr(kind, name) is not valid:
+            return Obstacle("step", f"{kind.__name__} has its own {name}")
+    if kind.step is not MujocoEnv.step:
+        return Obstacle("step", f"{kind.__name__} has its own step")
+    if env.has_renderer:
+        return Obstacle("viewer", "a viewer follows every substep (has_renderer)")
+    robot = robots[0]
     composite = robot.composite_controller
-    arm, gripper = (composite.part_controllers.get(name) for name in ("right", "right_gripper"))
-    kind = type(env)
-    if len(env.robots) != 1 or type(robot) is not FixedBaseRobot:
-        return "it moves one robot with a fixed base"
-    if kind.step is not MujocoEnv.step or kind._pre_action is not RobotEnv._pre_action:
-        return f"{kind.__name__} has a step of its own"
-    if env._observables or env.has_renderer:
-        return "robosuite's observables and viewer follow every substep"
-    if type(composite) is not CompositeController or len(composite.part_controllers) != 2:
-        return f"{type(composite).__name__} is not one arm and one gripper"
+    if type(composite) is not CompositeController or len(robot.arms) != 1:
+        return Obstacle("controller", f"{type(composite).__name__} is not BASIC for one arm")
+    parts, (name,) = composite.part_controllers, robot.arms
+    arm, gripper = parts.get(name), parts.get(f"{name}_gripper")
+    if len(parts) != 1 + (gripper is not None):
+        return Obstacle("controller", f"it controls {', '.join(parts)}; valid: arm and gripper")
     if type(arm) is not OperationalSpaceController or not arm.uncoupling:
-        return f"{type(arm).__name__} is not operational-space control with uncoupled rotation"
-    if type(gripper) is not SimpleGripController:
-        return f"{type(gripper).__name__} is not SimpleGripController"
-    if any((arm.interpolator_pos, arm.interpolator_ori, gripper.interpolator)):
-        return "it does not interpolate goals"
-    if not (env.lite_physics and arm.lite_physics):
-        return "lite_physics is off"
+        reason = f"{type(arm).__name__} is not operational-space control with uncoupled rotation"
+        return Obstacle("arm", reason)
+    if gripper is not None and type(gripper) is not SimpleGripController:
+        return Obstacle("gripper", f"{type(gripper).__name__} is not SimpleGripController")
+    interpolators = arm.interpolator_pos, arm.interpolator_ori, getattr(gripper, "interpolator", None)
+    if any(interpolator is not None for interpolator in interpolators):
+        return Obstacle("interpolation", "a controller interpolates its goals")
+    if not all(robot._enabled_parts.get(part) for part in parts):
+        return Obstacle("parts", "a part of the robot is disabled (enable_parts)")
     if not isinstance(opspace_matrices, numba.core.dispatcher.Dispatcher):
-        return "robosuite's macro ENABLE_NUMBA is off"
-    model = env.sim.model._model
+        return Obstacle("numba", "robosuite's macro ENABLE_NUMBA is off")
+    return None
+
+
+_METHODS = {
+    "_pre_action": RobotEnv._pre_action,
+    "_update_observables": MujocoEnv._update_observables,
+}
+
+
+def _model_obstacle(env: MujocoEnv) -> Obstacle | None:
+    """What a reset may change."""
+    robot, model = env.robots[0], env.sim.model._model
+    (name,) = robot.arms
+    arm = robot.composite_controller.part_controllers[name]
     base = model.site(f"{arm.naming_prefix}{arm.part_name}_center").bodyid[0]
     if model.body_weldid[base] != 0:
-        return "the arm's base moves"
-    actuators = robot._ref_actuators_indexes_dict["right"]
-    for indices in (arm.qpos_index, arm.qvel_index, actuators):
+        return Obstacle("base", "the arm's base moves")
+    for indices in (arm.qpos_index, arm.qvel_index, robot._ref_actuators_indexes_dict[name]):
         if list(indices) != list(range(indices[0], indices[0] + arm.joint_dim)):
-            return "the arm's joints are not in a row"
+            return Obstacle("joints", "the arm's joints are not in a row")
     return None
 
 
 class FastStepper:
-    """Advances one robosuite environment by a control period: what ``env.step`` does to its state.
+    """Advances the physics of one robosuite environment by a control period, as ``env.step`` does.
 
-    Positions, velocities and everything computed from them are the same bits as robosuite's own;
-    so are they when some steps of an episode are made by one and some by the other. Reward and
-    observation are left to the caller. Lasts from one reset to the next.
+    Positions, velocities, controls and what the controllers remember are the same bits as
+    robosuite's own, also where some steps of an episode are made by one and some by the other.
+    Rewards and observations are left to the caller
+    (:func:`~torchrl_bmrl.envs.acceleration.accelerate_robosuite` computes these, too). A stepper
+    lasts from one reset to the next.
 
     Args:
-        env: robosuite environment, reset.
+        env: robosuite environment without wrappers.
 
     Raises:
         BMRLError: if :func:`why_not_fast` gives a reason.
 
     Example:
-        >>> env = TabletopScene("lift", seed=0, use_object_obs=False)
-        >>> _ = env.reset()
-        >>> before = env.eef_position
+        >>> import robosuite
+        >>> env = robosuite.make("Lift", "Panda", has_offscreen_renderer=False,
+        ...                      use_camera_obs=False)
+        >>> before = env.reset()["robot0_eef_pos"]
         >>> FastStepper(env).step(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0]))
-        >>> bool(env.eef_position[2] > before[2])
+        >>> bool(env._get_observations(force_update=True)["robot0_eef_pos"][2] > before[2])
         True
     """
 
-    def __init__(self, env: TabletopScene) -> None:
-        if (reason := why_not_fast(env)) is not None:
-            raise BMRLError(f"no fast step here: {reason}")
-        robot, self.sim = env.robots[0], env.sim
-        self.composite = robot.composite_controller
-        self._arm, self._gripper = self.composite.part_controllers.values()
+    def __init__(self, env: MujocoEnv) -> None:
+        if (obstacle := why_not_fast(env)) is not None:
+            raise BMRLError(f"no fast step here: {obstacle}")
+        self.sim, self.robot = env.sim, env.robots[0]
         self._substeps = int(env.control_timestep / env.model_timestep)
-        # Held: the addresses below are theirs.
-        self._model, self._data = env.sim.model._model, env.sim.data._data
-        model, data, n = self._model, self._data, self._arm.joint_dim
-        site = model.site(self._arm.ref_name).id
-        arm, self._fingers = (
-            np.asarray(robot._ref_actuators_indexes_dict[name])
-            for name in ("right", "right_gripper")
-        )
-        limits = model.actuator_ctrlrange
-        self._finger_limits = limits[self._fingers].T.copy()
+        self.composite = self.robot.composite_controller
+        (name,) = self.robot.arms
+        self.arm = self.composite.part_controllers[name]
+        self.gripper = self.composite.part_controllers.get(f"{name}_gripper")
+        # Kept alive: the addresses below are theirs.
+        self.model, self.data = env.sim.model._model, env.sim.data._data
+        model, data, arm, n = self.model, self.data, self.arm, self.arm.joint_dim
+        indices = self.robot._ref_actuators_indexes_dict
+        fingers = [] if self.gripper is None else indices[f"{name}_gripper"]
+        site = model.site(arm.ref_name).id
         self._robot = _Robot(
             model=model._address,
             data=data._address,
             dot=id(np.dot),
+            lite=bool(env.lite_physics),
+            arm_lite=bool(arm.lite_physics),
             site=site,
-            dof=int(self._arm.qvel_index[0]),
-            joint=int(self._arm.qpos_index[0]),
-            actuator=int(arm[0]),
+            dof=int(arm.qvel_index[0]),
+            joint=int(arm.qpos_index[0]),
+            actuator=int(indices[name][0]),
+            fingers=np.asarray(fingers, dtype=np.int64),
             qpos=data.qpos,
             qvel=data.qvel,
             bias=data.qfrc_bias,
             inertia=data.qM,
             ctrl=data.ctrl,
-            position=data.site_xpos[site],
-            rotation=data.site_xmat[site].reshape(3, 3),
-            low=limits[arm, 0].copy(),
-            high=limits[arm, 1].copy(),
+            limits=model.actuator_ctrlrange,
+            site_position=data.site_xpos[site],
+            site_rotation=data.site_xmat[site].reshape(3, 3),
+        )
+        self._arm = _Arm(
+            mass=np.zeros((n, n), order="F"),
+            joint_position=np.zeros(n),
+            joint_velocity=np.zeros(n),
+            torque=np.zeros(n),
+            coordinates=np.zeros(model.nq + model.nv),
+            position=arm.ref_pos,
+            rotation=arm.ref_ori_mat,
+            velocity=arm.ref_pos_vel,
+            angular_velocity=arm.ref_ori_vel,
+            jacobian_position=arm.J_pos,
+            jacobian_rotation=arm.J_ori,
+            jacobian=arm.J_full,
         )
         wrench = np.zeros(6)
         scratch = self._scratch = _Scratch(
             jacobian_position=np.zeros((3, model.nv)),
             jacobian_rotation=np.zeros((3, model.nv)),
-            full_mass=np.zeros((model.nv, model.nv)),
-            mass=np.zeros((n, n), order="F"),
-            arm_position=np.zeros((3, n)),
-            arm_rotation=np.zeros((3, n)),
-            arm_jacobian=np.zeros((6, n)),
-            velocity=np.zeros(3),
-            angular_velocity=np.zeros(3),
+            mass=np.zeros((model.nv, model.nv)),
             lambda_position=np.zeros((3, 3), order="F"),
             lambda_rotation=np.zeros((3, 3), order="F"),
             force=np.zeros(3),
             torque=np.zeros(3),
             joint_torque=np.zeros(n),
         )
-        # Held, like the model and the data.
+        # Kept alive, like the model and the data.
         self._arguments = {
-            "velocity": (scratch.jacobian_position, data.qvel, scratch.velocity),
-            "angular_velocity": (scratch.jacobian_rotation, data.qvel, scratch.angular_velocity),
+            "velocity": (scratch.jacobian_position, data.qvel, arm.ref_pos_vel),
+            "angular_velocity": (scratch.jacobian_rotation, data.qvel, arm.ref_ori_vel),
             "force": (scratch.lambda_position, scratch.force, wrench[:3]),
             "torque": (scratch.lambda_rotation, scratch.torque, wrench[3:]),
-            "joint_torque": (scratch.arm_jacobian.T, wrench, scratch.joint_torque),
+            "joint_torque": (arm.J_full.T, wrench, scratch.joint_torque),
         }
         self._products = _Products(**{name: id(each) for name, each in self._arguments.items()})
 
-    def serves(self, env: TabletopScene) -> bool:
-        """Whether ``env`` still is as it was: no reset since, the same simulator."""
-        return self.sim is env.sim and self.composite is env.robots[0].composite_controller
+    def serves(self, env: MujocoEnv) -> bool:
+        """Whether ``env`` is as it was: no reset since, same simulator, controllers and settings."""
+        return (
+            self.sim is env.sim
+            and self.robot is env.robots[0]
+            and self.composite is self.robot.composite_controller
+            and self.arm in self.composite.part_controllers.values()
+            and self._robot.lite == env.lite_physics
+            and self._robot.arm_lite == self.arm.lite_physics
+            and _settings_obstacle(env) is None
+        )
 
     def step(self, action: np.ndarray) -> None:
-        """Acts for one control period.
+        """Acts for one control period; poses are then those of the joints.
+
+        robosuite's own step leaves poses one substep behind the joints. With poses that follow from
+        the joints, an observation is a function of the state.
 
         Args:
             action: as for ``env.step``.
         """
-        arm, gripper = self._arm, self._gripper
-        mujoco.mj_step1(self._model, self._data)
-        # All that setting a goal reads of the arm; the rest of its update is made in the loop.
-        arm.ref_pos[:], arm.ref_ori_mat[:] = self._robot.position, self._robot.rotation
-        arm.new_update = gripper.new_update = False
+        self.begin(action)
+        self.advance(self._substeps)
+        mujoco.mj_fwdPosition(self.model, self.data)
+
+    def begin(self, action: np.ndarray) -> None:
+        """Evaluates the positions and sets the controllers' goals, as each first substep does."""
+        arm, gripper, robot = self.arm, self.gripper, self._robot
+        (mujoco.mj_step1 if robot.lite else mujoco.mj_forward)(self.model, self.data)
+        self.seen = not arm.new_update
+        if self.seen:
+            self._arm.mass[:] = arm.mass_matrix
+            self._arm.joint_position[:] = arm.joint_pos
+            self._arm.joint_velocity[:] = arm.joint_vel
+        else:
+            if not robot.arm_lite:
+                mujoco.mj_forward(self.model, self.data)
+            # All that setting a goal reads of the arm; the rest of its update is in the loop.
+            arm.ref_pos[:], arm.ref_ori_mat[:] = robot.site_position, robot.site_rotation
+            arm.new_update = False
+        if gripper is not None:
+            gripper.new_update = False
         self.composite.update_state()
-        self.composite.set_goal(action)
+        try:
+            self.composite.set_goal(action)
+        finally:  # as it was, should the action be refused
+            arm.new_update = not self.seen
         position, rotation = arm.goal_pos, arm.goal_ori
         if arm.input_ref_frame == "base":
             position = arm.origin_pos + np.dot(arm.origin_ori, position)
             rotation = np.dot(arm.origin_ori, rotation)
-        self._robot.ctrl[self._fingers] = np.clip(gripper.run_controller(), *self._finger_limits)
-        goal = _Goal(position, rotation, arm.kp, arm.kd, np.array(arm.initial_joint))
-        _control_period(self._substeps, self._robot, self._scratch, self._products, goal)
-        arm.new_update = gripper.new_update = True
+        self._evaluated = True
+        self._goal = _Goal(
+            position=np.asarray(position, dtype=np.float64),
+            rotation=np.ascontiguousarray(rotation, dtype=np.float64),
+            kp=np.asarray(arm.kp, dtype=np.float64),
+            kd=np.asarray(arm.kd, dtype=np.float64),
+            rest=np.array(arm.initial_joint, dtype=np.float64),
+            fingers=np.zeros(0) if gripper is None else gripper.run_controller(),
+        )
+
+    def advance(self, substeps: int) -> None:
+        """Moves on by some substeps of the period; those of a period may come in several calls."""
+        state = self._arm
+        evaluated, seen = self._evaluated, self._evaluated and self.seen
+        _run(
+            substeps,
+            evaluated,
+            seen,
+            self._robot,
+            state,
+            self._scratch,
+            self._products,
+            self._goal,
+        )
+        self._evaluated = False
+        arm, gripper = self.arm, self.gripper
+        arm.mass_matrix, arm.torques = state.mass, state.torque
+        arm.joint_pos, arm.joint_vel = state.joint_position, state.joint_velocity
+        arm.new_update = True
+        if gripper is not None:
+            gripper.joint_pos = state.coordinates[gripper.qpos_index]
+            gripper.joint_vel = state.coordinates[self.model.nq :][gripper.qvel_index]
+            gripper.new_update = True

@@ -1,0 +1,207 @@
+"""Stock robosuite environments that step several times faster and return the same numbers."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, TypeVar
+
+import numpy as np
+
+from torchrl_bmrl.envs.stepper import FastStepper, why_not_fast
+from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.extras import needs
+
+with needs("robosuite"):
+    import mujoco
+    import robosuite.utils.transform_utils as T
+    from robosuite.environments.base import MujocoEnv
+    from robosuite.utils.observables import Observable
+    from robosuite.wrappers import Wrapper
+
+Env = TypeVar("Env", bound="MujocoEnv | Wrapper")
+
+_AVERAGE = np.ones(10) / 10.0  # robosuite's filter of accelerations
+
+
+def accelerate_robosuite(env: Env) -> Env:
+    """Makes a robosuite environment step fast; everything that ``step`` returns stays the same.
+
+    Observations, rewards, ends of episodes and MuJoCo's state are the same bits as robosuite's own,
+    through hard and soft resets. Any task works with one fixed-base arm of any make, any gripper
+    and operational-space control without interpolation, robosuite's default.
+
+    If a later change of the environment makes fast steps impossible, robosuite's own step is used
+    and a ``RuntimeWarning`` gives the reason. ``del env.step`` restores robosuite's step for good.
+
+    Args:
+        env: robosuite environment, changed in place. Wrappers may be around it or come later.
+
+    Returns:
+        The same ``env``.
+
+    Raises:
+        BMRLError: if :func:`~torchrl_bmrl.envs.stepper.why_not_fast` gives a reason.
+
+    Example:
+        >>> import robosuite
+        >>> env = accelerate_robosuite(robosuite.make("Stack", "UR5e", use_camera_obs=False,
+        ...                                           has_offscreen_renderer=False))
+        >>> _ = env.reset()
+        >>> observation, reward, done, info = env.step(np.zeros(env.action_dim))
+        >>> observation["robot0_joint_pos"].shape
+        (6,)
+    """
+    stock: Any = env
+    while isinstance(stock, Wrapper):
+        stock = stock.env
+    if (obstacle := why_not_fast(stock)) is not None:
+        raise BMRLError(f"{type(stock).__name__} cannot step fast: {obstacle}")
+    stock.step = _FastStep(stock)
+    return env
+
+
+class _FastStep:
+    """Takes the place of an environment's ``step``."""
+
+    def __init__(self, env: MujocoEnv) -> None:
+        self.env = env
+        self.stepper: FastStepper | None = None
+        self.memory: _Memory
+        self.said: set[str] = set()
+
+    def __call__(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, dict[str, Any]]:
+        env = self.env
+        stepper = self.stepper
+        if stepper is None or not stepper.serves(env):
+            self.stepper = None  # frees the last episode's model
+            if (obstacle := why_not_fast(env)) is not None:
+                if obstacle.reason not in self.said:
+                    self.said.add(obstacle.reason)
+                    message = f"steps are robosuite's own, and slow: {obstacle}"
+                    warnings.warn(message, RuntimeWarning, stacklevel=2)
+                return type(env).step(env, action)
+            self.stepper = stepper = FastStepper(env)
+            self.memory = _Memory(stepper)
+        if env.done:
+            raise ValueError("executing action in terminated episode")
+        env.timestep += 1
+        assert len(action) == env.action_dim, (
+            f"environment got invalid action dimension -- expected {env.action_dim}, "
+            f"got {len(action)}"
+        )
+        stepper.begin(action)
+        self.memory.push(action)
+        left = int(env.control_timestep / env.model_timestep)
+        while left:
+            substeps, due = _next_samples(env, left)
+            stepper.advance(substeps)
+            for observable in due:
+                observable.update(env.model_timestep, env._obs_cache)
+            left -= substeps
+        env.cur_time += env.control_timestep
+        reward, done, info = env._post_action(action)
+        return env._get_observations(), reward, done, info
+
+
+def _next_samples(env: MujocoEnv, limit: int) -> tuple[int, list[Observable]]:
+    """Winds the clocks of observables on to the next substep in which one of them is sampled.
+
+    robosuite updates each observable in each substep. Except for one update in a sampling period,
+    this only counts time, and that is done here for all substeps at once.
+
+    Returns:
+        The number of substeps until then, at most ``limit``, and the observables whose update in
+        the last of them is still to be made.
+    """
+    timestep = env.model_timestep
+    clock, quiet = None, 0
+    waits: list[tuple[int, Observable]] = []
+    for observable in env._observables.values():
+        if type(observable) is not Observable:
+            waits.append((0, observable))  # robosuite calls its update in every substep
+        elif observable._enabled:
+            if (now := _clock(observable)) != clock:  # mostly all are in step
+                clock, quiet = now, _wind(now, timestep, limit)[0]
+            waits.append((quiet, observable))
+    first = min((quiet for quiet, _ in waits), default=limit)
+    due = []
+    for quiet, observable in waits:
+        if type(observable) is Observable:
+            updates = first if quiet == first else min(first + 1, limit)
+            key = (_clock(observable), updates)
+            if key != clock:
+                clock, wound = key, _wind(key[0], timestep, updates)
+            _, observable._time_since_last_sample, observable._sampled = wound
+        if quiet == first < limit:
+            due.append(observable)
+    return min(first + 1, limit), due
+
+
+def _clock(observable: Observable) -> tuple[float, bool, float, float]:
+    return (
+        observable._time_since_last_sample,
+        observable._sampled,
+        observable._sampling_timestep,
+        observable._current_delay,
+    )
+
+
+def _wind(
+    clock: tuple[float, bool, float, float], timestep: float, limit: int
+) -> tuple[int, float, bool]:
+    """How many updates take no sample, at most ``limit``, and the clock after them.
+
+    The arithmetic is that of ``Observable.update``, whose rounding decides when a sample is due.
+    """
+    time, sampled, period, delay = clock
+    for quiet in range(limit):
+        later = time + timestep
+        if not sampled and (period - delay >= later or later >= period):
+            return quiet, time, sampled
+        if later >= period:
+            later, sampled = later % period, False
+        time = later
+    return limit, time, sampled
+
+
+class _Memory:
+    """What the robot remembers of the last actions, forces and poses (``robot.recent_...``)."""
+
+    def __init__(self, stepper: FastStepper) -> None:
+        self.stepper, robot = stepper, stepper.robot
+        (self.name,) = robot.arms
+        model = stepper.model
+        sensors = robot.gripper[self.name].important_sensors
+        indices: list[int] = []
+        for kind in ("force_ee", "torque_ee"):
+            # robosuite's own address of a sensor
+            sensor = model.sensor(sensors[kind]).id
+            start = int(np.sum(model.sensor_dim[:sensor]))
+            indices += range(start, start + int(model.sensor_dim[sensor]))
+        self.sensors = np.array(indices)
+        self.jacobians = np.zeros((2, 3, model.nv))
+        self.site = model.site(stepper.arm.ref_name).id
+
+    def push(self, action: np.ndarray) -> None:
+        """As ``FixedBaseRobot.control`` does after the first substep's controls are set."""
+        robot, name, arm, data = self.stepper.robot, self.name, self.stepper.arm, self.stepper.data
+        robot.recent_qpos.push(robot._joint_positions)
+        robot.recent_actions.push(action)
+        robot.recent_torques.push(robot.torques)
+        robot.recent_ee_forcetorques[name].push(data.sensordata[self.sensors])
+        pose = np.concatenate((arm.ref_pos, T.mat2quat(arm.ref_ori_mat)))
+        robot.recent_ee_pose[name].push(pose)
+        if not self.stepper.seen:
+            mujoco.mj_jacSite(self.stepper.model, data, *self.jacobians, self.site)
+            np.dot(self.jacobians[0], data.qvel, out=arm.ref_pos_vel)
+            np.dot(self.jacobians[1], data.qvel, out=arm.ref_ori_vel)
+        velocity = np.concatenate((arm.ref_pos_vel, arm.ref_ori_vel))
+        robot.recent_ee_vel[name].push(velocity)
+        velocities = robot.recent_ee_vel_buffer[name]
+        velocities.push(velocity)
+        accelerations = np.empty((6, 10))
+        accelerations[:, 0] = robot.recent_ee_acc[name].current
+        accelerations[:, 1:] = (robot.control_freq * np.diff(velocities.buf, axis=0)).T
+        # np.convolve of ten with ten is one scalar product; a matrix product rounds differently.
+        average = np.array([np.dot(axis, _AVERAGE) for axis in accelerations])
+        robot.recent_ee_acc[name].push(average)
