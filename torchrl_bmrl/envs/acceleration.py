@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from torchrl_bmrl.envs.shortcuts import take_shortcuts
 from torchrl_bmrl.envs.stepper import FastStepper, why_not_fast
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.extras import needs
@@ -56,6 +57,7 @@ def accelerate_robosuite(env: Env) -> Env:
         stock = stock.env
     if (obstacle := why_not_fast(stock)) is not None:
         raise BMRLError(f"{type(stock).__name__} cannot step fast: {obstacle}")
+    take_shortcuts(stock)
     stock.step = _FastStep(stock)
     return env
 

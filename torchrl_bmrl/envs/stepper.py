@@ -56,6 +56,8 @@ _mj_jac_site = types.ExternalFunction("mj_jacSite", types.void(*[_address] * 4, 
 _mj_full_m = types.ExternalFunction("mj_fullM", types.void(*[_address] * 3))
 _py_call = types.ExternalFunction("PyObject_Call", _address(*[_address] * 3))
 _py_decref = types.ExternalFunction("Py_DecRef", types.void(_address))
+# Without the dispatch to other libraries' arrays, which takes as long as a small product.
+_dot = getattr(np.dot, "_implementation", np.dot)
 
 
 class _Robot(NamedTuple):
@@ -67,6 +69,8 @@ class _Robot(NamedTuple):
     lite: bool  # physics in two halves, robosuite's default
     arm_lite: bool  # the controller does not evaluate the physics again
     site: int  # end-effector
+    base: int  # site whose frame the goal is in; -1 if it never moves
+    base_frame: bool  # the goal is in that frame, and not in the world's
     dof: int  # first of the arm's in qvel
     joint: int  # first of the arm's in qpos
     actuator: int  # first of the arm's in ctrl
@@ -79,6 +83,7 @@ class _Robot(NamedTuple):
     limits: np.ndarray  # (nu, 2), of ctrl
     site_position: np.ndarray
     site_rotation: np.ndarray
+    base_position: np.ndarray
 
 
 class _Arm(NamedTuple):
@@ -103,6 +108,12 @@ class _Scratch(NamedTuple):
 
     jacobian_position: np.ndarray  # (3, nv)
     jacobian_rotation: np.ndarray  # (3, nv)
+    base_jacobian_position: np.ndarray  # (3, nv)
+    base_jacobian_rotation: np.ndarray  # (3, nv)
+    base_velocity: np.ndarray  # (3,)
+    base_angular_velocity: np.ndarray  # (3,)
+    goal_offset: np.ndarray  # (3,), of the goal from the base
+    goal_rotation: np.ndarray  # (3, 3), world
     mass: np.ndarray  # (nv, nv)
     lambda_position: np.ndarray  # (3, 3)
     lambda_rotation: np.ndarray  # (3, 3)
@@ -119,13 +130,17 @@ class _Products(NamedTuple):
     force: int
     torque: int
     joint_torque: int
+    base_velocity: int
+    base_angular_velocity: int
+    goal_offset: int
+    goal_rotation: int
 
 
 class _Goal(NamedTuple):
     """Where the arm is to go, how stiffly, and what the gripper is to do."""
 
-    position: np.ndarray  # (3,) [m], world
-    rotation: np.ndarray  # (3, 3), world
+    position: np.ndarray  # (3,) [m], world; not used while a moving base decides
+    rotation: np.ndarray  # (3, 3), world; likewise
     kp: np.ndarray  # (6,)
     kd: np.ndarray  # (6,)
     rest: np.ndarray  # (n,) [rad], of the null space
@@ -192,14 +207,29 @@ def _run(
             arm.jacobian[3:] = arm.jacobian_rotation
             arm.joint_position[:] = robot.qpos[joints]
             arm.joint_velocity[:] = robot.qvel[dofs]
+        if robot.base >= 0:
+            _mj_jac_site(
+                robot.model,
+                robot.data,
+                scratch.base_jacobian_position.ctypes.data,
+                scratch.base_jacobian_rotation.ctypes.data,
+                robot.base,
+            )
+            _numpy_dot(robot.dot, products.base_velocity)
+            _numpy_dot(robot.dot, products.base_angular_velocity)
+            if robot.base_frame:
+                _numpy_dot(robot.dot, products.goal_offset)
+                _numpy_dot(robot.dot, products.goal_rotation)
+                goal.position[:] = robot.base_position + scratch.goal_offset
+                goal.rotation[:] = scratch.goal_rotation
         error = orientation_error(goal.rotation, arm.rotation)
         for i in range(3):
+            slowing = -(arm.velocity[i] - scratch.base_velocity[i])
             scratch.force[i] = (goal.position[i] - arm.position[i]) * goal.kp[i] + (
-                -arm.velocity[i]
-            ) * goal.kd[i]
-            scratch.torque[i] = (
-                error[i] * goal.kp[i + 3] + (-arm.angular_velocity[i]) * goal.kd[i + 3]
+                slowing * goal.kd[i]
             )
+            slowing = -(arm.angular_velocity[i] - scratch.base_angular_velocity[i])
+            scratch.torque[i] = error[i] * goal.kp[i + 3] + slowing * goal.kd[i + 3]
         _, lambda_position, lambda_rotation, nullspace = opspace_matrices(
             arm.mass, arm.jacobian, arm.jacobian_position, arm.jacobian_rotation
         )
@@ -233,12 +263,12 @@ class Obstacle:
 
     Args:
         kind: one of ``library``, ``closed``, ``robots``, ``step``, ``viewer``, ``controller``,
-            ``arm``, ``gripper``, ``interpolation``, ``parts``, ``numba``, ``base``, ``joints``.
+            ``arm``, ``gripper``, ``interpolation``, ``parts``, ``numba``, ``joints``.
         reason: a sentence for a person.
 
     Example:
-        >>> print(Obstacle("base", "the arm's base moves"))
-        the arm's base moves
+        >>> print(Obstacle("numba", "robosuite's macro ENABLE_NUMBA is off"))
+        robosuite's macro ENABLE_NUMBA is off
     """
 
     kind: str
@@ -309,9 +339,6 @@ def _model_obstacle(env: MujocoEnv) -> Obstacle | None:
     robot, model = env.robots[0], env.sim.model._model
     (name,) = robot.arms
     arm = robot.composite_controller.part_controllers[name]
-    base = model.site(f"{arm.naming_prefix}{arm.part_name}_center").bodyid[0]
-    if model.body_weldid[base] != 0:
-        return Obstacle("base", "the arm's base moves")
     for indices in (arm.qpos_index, arm.qvel_index, robot._ref_actuators_indexes_dict[name]):
         if list(indices) != list(range(indices[0], indices[0] + arm.joint_dim)):
             return Obstacle("joints", "the arm's joints are not in a row")
@@ -358,13 +385,19 @@ class FastStepper:
         indices = self.robot._ref_actuators_indexes_dict
         fingers = [] if self.gripper is None else indices[f"{name}_gripper"]
         site = model.site(arm.ref_name).id
+        base = model.site(f"{arm.naming_prefix}{arm.part_name}_center")
+        # On some arms, such as IIWA, the controller's frame turns with the first joint.
+        moves = bool(model.body_weldid[base.bodyid[0]] != 0)
+        base_rotation = data.site_xmat[base.id].reshape(3, 3)
         self._robot = _Robot(
             model=model._address,
             data=data._address,
-            dot=id(np.dot),
+            dot=id(_dot),
             lite=bool(env.lite_physics),
             arm_lite=bool(arm.lite_physics),
             site=site,
+            base=base.id if moves else -1,
+            base_frame=arm.input_ref_frame == "base",
             dof=int(arm.qvel_index[0]),
             joint=int(arm.qpos_index[0]),
             actuator=int(indices[name][0]),
@@ -377,6 +410,7 @@ class FastStepper:
             limits=model.actuator_ctrlrange,
             site_position=data.site_xpos[site],
             site_rotation=data.site_xmat[site].reshape(3, 3),
+            base_position=data.site_xpos[base.id],
         )
         self._arm = _Arm(
             mass=np.zeros((n, n), order="F"),
@@ -396,6 +430,12 @@ class FastStepper:
         scratch = self._scratch = _Scratch(
             jacobian_position=np.zeros((3, model.nv)),
             jacobian_rotation=np.zeros((3, model.nv)),
+            base_jacobian_position=np.zeros((3, model.nv)),
+            base_jacobian_rotation=np.zeros((3, model.nv)),
+            base_velocity=np.zeros(3),
+            base_angular_velocity=np.zeros(3),
+            goal_offset=np.zeros(3),
+            goal_rotation=np.zeros((3, 3)),
             mass=np.zeros((model.nv, model.nv)),
             lambda_position=np.zeros((3, 3), order="F"),
             lambda_rotation=np.zeros((3, 3), order="F"),
@@ -403,6 +443,7 @@ class FastStepper:
             torque=np.zeros(3),
             joint_torque=np.zeros(n),
         )
+        self._local_position, self._local_rotation = np.zeros(3), np.zeros((3, 3))
         # Kept alive, like the model and the data.
         self._arguments = {
             "velocity": (scratch.jacobian_position, data.qvel, arm.ref_pos_vel),
@@ -410,6 +451,14 @@ class FastStepper:
             "force": (scratch.lambda_position, scratch.force, wrench[:3]),
             "torque": (scratch.lambda_rotation, scratch.torque, wrench[3:]),
             "joint_torque": (arm.J_full.T, wrench, scratch.joint_torque),
+            "base_velocity": (scratch.base_jacobian_position, data.qvel, scratch.base_velocity),
+            "base_angular_velocity": (
+                scratch.base_jacobian_rotation,
+                data.qvel,
+                scratch.base_angular_velocity,
+            ),
+            "goal_offset": (base_rotation, self._local_position, scratch.goal_offset),
+            "goal_rotation": (base_rotation, self._local_rotation, scratch.goal_rotation),
         }
         self._products = _Products(**{name: id(each) for name, each in self._arguments.items()})
 
@@ -422,6 +471,7 @@ class FastStepper:
             and self.arm in self.composite.part_controllers.values()
             and self._robot.lite == env.lite_physics
             and self._robot.arm_lite == self.arm.lite_physics
+            and self._robot.base_frame == (self.arm.input_ref_frame == "base")
             and _settings_obstacle(env) is None
         )
 
@@ -461,13 +511,14 @@ class FastStepper:
         finally:  # as it was, should the action be refused
             arm.new_update = not self.seen
         position, rotation = arm.goal_pos, arm.goal_ori
-        if arm.input_ref_frame == "base":
+        if robot.base_frame:
+            self._local_position[:], self._local_rotation[:] = position, rotation
             position = arm.origin_pos + np.dot(arm.origin_ori, position)
             rotation = np.dot(arm.origin_ori, rotation)
         self._evaluated = True
         self._goal = _Goal(
-            position=np.asarray(position, dtype=np.float64),
-            rotation=np.ascontiguousarray(rotation, dtype=np.float64),
+            position=np.array(position, dtype=np.float64),
+            rotation=np.array(rotation, dtype=np.float64, order="C"),
             kp=np.asarray(arm.kp, dtype=np.float64),
             kd=np.asarray(arm.kd, dtype=np.float64),
             rest=np.array(arm.initial_joint, dtype=np.float64),
