@@ -7,8 +7,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from torchrl_bmrl.envs.obstacles import why_not_fast
 from torchrl_bmrl.envs.shortcuts import take_shortcuts
-from torchrl_bmrl.envs.stepper import FastStepper, why_not_fast
+from torchrl_bmrl.envs.stepper import FastStepper
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.extras import needs
 
@@ -20,6 +21,7 @@ with needs("robosuite"):
     from robosuite.wrappers import Wrapper
 
 Env = TypeVar("Env", bound="MujocoEnv | Wrapper")
+Clock = tuple[float, bool, float, float]  # time since a sample, sampled, period, delay [s]
 
 _AVERAGE = np.ones(10) / 10.0  # robosuite's filter of accelerations
 
@@ -41,12 +43,13 @@ def accelerate_robosuite(env: Env) -> Env:
         The same ``env``.
 
     Raises:
-        BMRLError: if :func:`~torchrl_bmrl.envs.stepper.why_not_fast` gives a reason.
+        BMRLError: if :func:`~torchrl_bmrl.envs.obstacles.why_not_fast` gives a reason.
 
     Example:
         >>> import robosuite
-        >>> env = accelerate_robosuite(robosuite.make("Stack", "UR5e", use_camera_obs=False,
-        ...                                           has_offscreen_renderer=False))
+        >>> env = accelerate_robosuite(
+        ...     robosuite.make("Stack", "UR5e", use_camera_obs=False, has_offscreen_renderer=False)
+        ... )
         >>> _ = env.reset()
         >>> observation, reward, done, info = env.step(np.zeros(env.action_dim))
         >>> observation["robot0_joint_pos"].shape
@@ -116,30 +119,36 @@ def _next_samples(env: MujocoEnv, limit: int) -> tuple[int, list[Observable]]:
         the last of them is still to be made.
     """
     timestep = env.model_timestep
-    clock, quiet = None, 0
-    waits: list[tuple[int, Observable]] = []
+    quiet: dict[Clock, int] = {}  # updates before the one that samples; few clocks differ
+    counted, clocks, first = [], [], limit
     for observable in env._observables.values():
+        clock = None
         if type(observable) is not Observable:
-            waits.append((0, observable))  # robosuite calls its update in every substep
-        elif observable._enabled:
-            if (now := _clock(observable)) != clock:  # mostly all are in step
-                clock, quiet = now, _wind(now, timestep, limit)[0]
-            waits.append((quiet, observable))
-    first = min((quiet for quiet, _ in waits), default=limit)
+            first = 0  # its update may do anything: it is called in every substep
+        elif not observable._enabled:
+            continue
+        else:
+            clock = _clock(observable)
+            if clock not in quiet:
+                quiet[clock] = _wind(clock, timestep, limit)[0]
+                first = min(first, quiet[clock])
+        counted.append(observable)
+        clocks.append(clock)
+    substeps = min(first + 1, limit)
+    wound: dict[Clock, tuple[int, float, bool]] = {}
     due = []
-    for quiet, observable in waits:
-        if type(observable) is Observable:
-            updates = first if quiet == first else min(first + 1, limit)
-            key = (_clock(observable), updates)
-            if key != clock:
-                clock, wound = key, _wind(key[0], timestep, updates)
-            _, observable._time_since_last_sample, observable._sampled = wound
-        if quiet == first < limit:
-            due.append(observable)
-    return min(first + 1, limit), due
+    for observable, clock in zip(counted, clocks, strict=True):
+        if clock is not None:
+            if clock not in wound:
+                wound[clock] = _wind(clock, timestep, substeps)
+            updates, observable._time_since_last_sample, observable._sampled = wound[clock]
+            if updates == substeps:
+                continue
+        due.append(observable)
+    return substeps, due
 
 
-def _clock(observable: Observable) -> tuple[float, bool, float, float]:
+def _clock(observable: Observable) -> Clock:
     return (
         observable._time_since_last_sample,
         observable._sampled,
@@ -148,18 +157,16 @@ def _clock(observable: Observable) -> tuple[float, bool, float, float]:
     )
 
 
-def _wind(
-    clock: tuple[float, bool, float, float], timestep: float, limit: int
-) -> tuple[int, float, bool]:
-    """How many updates take no sample, at most ``limit``, and the clock after them.
+def _wind(clock: Clock, timestep: float, limit: int) -> tuple[int, float, bool]:
+    """How many updates take no sample, at most ``limit``, and time and flag after them.
 
     The arithmetic is that of ``Observable.update``, whose rounding decides when a sample is due.
     """
     time, sampled, period, delay = clock
-    for quiet in range(limit):
+    for updates in range(limit):
         later = time + timestep
         if not sampled and (period - delay >= later or later >= period):
-            return quiet, time, sampled
+            return updates, time, sampled
         if later >= period:
             later, sampled = later % period, False
         time = later

@@ -28,13 +28,15 @@ def take_shortcuts(env: MujocoEnv) -> None:
 
 
 def _check_contact(env: MujocoEnv, geoms_1: Any, geoms_2: Any = None) -> bool:
-    """As ``MujocoEnv.check_contact``, by numbers of geoms in place of names."""
+    """As ``MujocoEnv.check_contact``, with one look-up of names for all contacts."""
     data = env.sim.data._data
     if not data.ncon:
         return False
-    first = _numbers(env, geoms_1)
-    second = None if geoms_2 is None else _numbers(env, geoms_2)
-    for one, other in data.contact.geom.tolist():
+    name_of = env.sim.model._geom_id2name
+    first = _names(geoms_1)
+    second = None if geoms_2 is None else _names(geoms_2)
+    for pair in data.contact.geom.tolist():
+        one, other = name_of[pair[0]], name_of[pair[1]]
         if one in first and (second is None or other in second):
             return True
         if other in first and (second is None or one in second):
@@ -42,13 +44,10 @@ def _check_contact(env: MujocoEnv, geoms_1: Any, geoms_2: Any = None) -> bool:
     return False
 
 
-def _numbers(env: MujocoEnv, geoms: str | Iterable[str] | MujocoModel) -> set[int | None]:
+def _names(geoms: str | Iterable[str] | MujocoModel) -> set[str]:
     if isinstance(geoms, str):
-        geoms = [geoms]
-    elif isinstance(geoms, MujocoModel):
-        geoms = geoms.contact_geoms
-    numbers = env.sim.model._geom_name2id
-    return {numbers[name] for name in geoms if name in numbers}
+        return {geoms}
+    return set(geoms.contact_geoms if isinstance(geoms, MujocoModel) else geoms)
 
 
 def _wipe_information(env: Wipe) -> tuple[float, np.ndarray, np.ndarray]:
