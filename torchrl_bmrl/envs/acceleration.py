@@ -58,6 +58,10 @@ def accelerate_robosuite(env: Env) -> Env:
     stock: Any = env
     while isinstance(stock, Wrapper):
         stock = stock.env
+    if not isinstance(vars(stock).get("step"), (_FastStep, type(None))):
+        raise BMRLError(
+            f"{type(stock).__name__}.step was replaced by {stock.step}; delete it first"
+        )
     if (obstacle := why_not_fast(stock)) is not None:
         raise BMRLError(f"{type(stock).__name__} cannot step fast: {obstacle}")
     take_shortcuts(stock)
