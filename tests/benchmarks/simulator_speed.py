@@ -2,10 +2,14 @@
 
     python tests/benchmarks/simulator_speed.py [--rounds 5] [--episodes 60]
 
-The ceiling is 25 bare ``mj_step1`` and ``mj_step2``, from the states of the same episode, on
-robosuite's model and on the one without pictures. Variants take turns on one thread, an expert's
-episode each; the tables hold the fastest round of each, and ratios within one round. Memory is
-resident, of a process of its own.
+First come stock robosuite's environments, accelerated and not: in each round both play the same
+episode of random, saturated and still actions, with shaped rewards and all observations, and every
+returned number and MuJoCo's state are compared.
+
+Then come this package's tasks. The ceiling is 25 bare ``mj_step1`` and ``mj_step2``, from the
+states of the same episode, on robosuite's model and on the one without pictures. Variants take
+turns on one thread, an expert's episode each. The tables show the fastest round of each variant and
+the median of the rounds' ratios. Memory is resident, of a process of its own.
 """
 
 from __future__ import annotations
@@ -24,12 +28,15 @@ from contextlib import closing
 from pathlib import Path
 from statistics import median
 from time import perf_counter
+from typing import Any
 
 import mujoco
 import numpy as np
+import robosuite
 import torch
 
-from torchrl_bmrl.envs.tabletop import TabletopEnv
+from torchrl_bmrl.envs.acceleration import accelerate_robosuite
+from torchrl_bmrl.envs.sawyer import SawyerEnv
 from torchrl_bmrl.envs.transforms import make_env
 from torchrl_bmrl.evaluation.rollout import evaluate_policy
 from torchrl_bmrl.experts.collect import collect_demonstrations
@@ -39,6 +46,8 @@ from torchrl_bmrl.names import HORIZON, STEPPERS, TASKS
 from torchrl_bmrl.pipeline.agents import make_bcq_loss
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+STOCK = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "Wipe")
+ARMS = ("Panda", "Sawyer", "UR5e")
 
 
 def seconds(call: Callable[[], object]) -> float:
@@ -48,7 +57,56 @@ def seconds(call: Callable[[], object]) -> float:
     return perf_counter() - start
 
 
-def episode(env: TabletopEnv, steps: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def stock_table(rounds: int, steps: int = 25) -> None:
+    """Control steps per second of robosuite's environments, stock and accelerated."""
+    print("\n| Environment | arm | stock | fast | fast / stock | equal to the bit |\n"
+          "|---|---|---:|---:|---:|---|")  # fmt: skip
+    for task in STOCK:
+        for arm in ARMS:
+            stock, fast = (stock_environment(task, arm) for _ in range(2))
+            accelerate_robosuite(fast)
+            play_stock(stock, 0, 2)
+            play_stock(fast, 0, 2)  # compiled, and in the caches
+            times, equal = [], True
+            for number in range(rounds):
+                (theirs, expected), (ours, got) = (
+                    play_stock(env, number, steps) for env in (stock, fast)
+                )
+                times.append((theirs, ours))
+                equal = equal and expected == got
+            speeds = [3 * steps / min(column) for column in zip(*times, strict=True)]
+            gain = median(theirs / ours for theirs, ours in times)
+            print(f"| {task} | {arm} | {speeds[0]:.0f} | {speeds[1]:.0f} | {gain:.2f} | "
+                  f"{'yes' if equal else 'no'} |", flush=True)  # fmt: skip
+
+
+def stock_environment(task: str, arm: str) -> Any:
+    """robosuite's environment without pictures, otherwise with its defaults and shaped rewards."""
+    env = robosuite.make(
+        task, arm, use_camera_obs=False, has_offscreen_renderer=False, reward_shaping=True,
+        ignore_done=True, seed=0,
+    )  # fmt: skip
+    env.early_terminations = False  # Wipe ends at the first collision otherwise
+    return env
+
+
+def play_stock(env: Any, seed: int, steps: int) -> tuple[float, list[bytes]]:
+    """Time of an episode's steps, and all that came out of it."""
+    rng, outcome, total = np.random.default_rng(seed), [], 0.0
+    held = np.sign(rng.standard_normal(env.action_dim))
+    actions = [*rng.uniform(-1, 1, (steps, env.action_dim)), *[held] * steps, *[0 * held] * steps]
+    env.reset()
+    for action in actions:
+        start = perf_counter()
+        observation, reward, done, info = env.step(action)
+        total += perf_counter() - start
+        data = env.sim.data._data
+        arrays = [*observation.values(), data.qpos, data.qvel, data.act, data.ctrl, reward, done]
+        outcome += [np.asarray(array).tobytes() for array in arrays] + [repr(info).encode()]
+    return total, outcome
+
+
+def episode(env: SawyerEnv, steps: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Actions of a noisy expert, and the states in which they were taken."""
     env.reset(seed=0)
     expert, rng = make_expert(env.robosuite_env), np.random.default_rng(0)
@@ -186,6 +244,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=60)
     options = parser.parse_args()
     torch.set_num_threads(1)
+    stock_table(options.rounds)
     step_table(options.rounds)
     policy_table()
     memory_table()

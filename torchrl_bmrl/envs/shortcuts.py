@@ -24,7 +24,7 @@ def take_shortcuts(env: MujocoEnv) -> None:
     """Replaces the slow methods of one environment whose class takes them from robosuite."""
     for name, (stock, faster) in _SHORTCUTS.items():
         if name not in vars(env) and getattr(type(env), name, None) is stock:
-            setattr(env, name, partial(faster, env))
+            setattr(env, name, faster(env))
 
 
 def _check_contact(env: MujocoEnv, geoms_1: Any, geoms_2: Any = None) -> bool:
@@ -50,29 +50,39 @@ def _names(geoms: str | Iterable[str] | MujocoModel) -> set[str]:
     return set(geoms.contact_geoms if isinstance(geoms, MujocoModel) else geoms)
 
 
-def _wipe_information(env: Wipe) -> tuple[float, np.ndarray, np.ndarray]:
+class _WipeInformation:
     """As ``Wipe._get_wipe_information``; the running sum adds in its order."""
-    centroid = mean = np.zeros(3)
-    radius: Any = 0
-    if len(env.wiped_markers) < env.num_markers:
-        wiped, numbers = set(map(id, env.wiped_markers)), env.sim.model._body_name2id
-        left = [
-            numbers[marker.root_body]
-            for marker in env.model.mujoco_arena.markers
-            if id(marker) not in wiped
-        ]
-        positions = env.sim.data.body_xpos[left]
-        if left:
-            centroid = np.add.accumulate(np.vstack([centroid, positions]))[-1]
-        centroid = centroid / max(1, len(left))
-        offsets = [centroid - env._get_eef_xpos(arm) for arm in env.robots[0].arms]
-        mean = offsets[np.argmin([np.linalg.norm(offset) for offset in offsets])]
-        if left:
-            radius = np.max(np.linalg.norm(positions - centroid, axis=1))
-    return radius, centroid, mean
+
+    def __init__(self, env: Wipe) -> None:
+        self.env = env
+        self.sim: Any = None
+
+    def __call__(self) -> tuple[float, np.ndarray, np.ndarray]:
+        env = self.env
+        if self.sim is not env.sim:
+            self.sim, self.markers = env.sim, env.model.mujoco_arena.markers
+            self.bodies = [env.sim.model.body_name2id(marker.root_body) for marker in self.markers]
+        centroid = mean = np.zeros(3)
+        radius: Any = 0
+        if len(env.wiped_markers) < env.num_markers:
+            wiped = set(map(id, env.wiped_markers))
+            left = [
+                body
+                for marker, body in zip(self.markers, self.bodies, strict=True)
+                if id(marker) not in wiped
+            ]
+            positions = env.sim.data.body_xpos[left]
+            if left:
+                centroid = np.add.accumulate(np.vstack([centroid, positions]))[-1]
+            centroid = centroid / max(1, len(left))
+            offsets = [centroid - env._get_eef_xpos(arm) for arm in env.robots[0].arms]
+            mean = offsets[np.argmin([np.linalg.norm(offset) for offset in offsets])]
+            if left:
+                radius = np.max(np.linalg.norm(positions - centroid, axis=1))
+        return radius, centroid, mean
 
 
 _SHORTCUTS: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
-    "check_contact": (MujocoEnv.check_contact, _check_contact),
-    "_get_wipe_information": (Wipe._get_wipe_information, _wipe_information),
+    "check_contact": (MujocoEnv.check_contact, lambda env: partial(_check_contact, env)),
+    "_get_wipe_information": (Wipe._get_wipe_information, _WipeInformation),
 }
