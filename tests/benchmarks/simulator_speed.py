@@ -83,7 +83,7 @@ def stock_table(rounds: int, steps: int = 25) -> None:
 def stock_environment(task: str, arm: str) -> Any:
     """robosuite's environment without pictures, otherwise with its defaults and shaped rewards."""
     env = robosuite.make(
-        task, arm, use_camera_obs=False, has_offscreen_renderer=False, reward_shaping=True,
+        task, robots=arm, use_camera_obs=False, has_offscreen_renderer=False, reward_shaping=True,
         ignore_done=True, seed=0,
     )  # fmt: skip
     env.early_terminations = False  # Wipe ends at the first collision otherwise

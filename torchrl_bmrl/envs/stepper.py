@@ -187,6 +187,7 @@ class FastStepper:
             # All that setting a goal reads of the arm; the rest of its update is in the loop.
             arm.ref_pos[:], arm.ref_ori_mat[:] = robot.site_position, robot.site_rotation
             arm.new_update = False
+        self._gripper_seen = gripper is not None and not gripper.new_update
         if gripper is not None:
             gripper.new_update = False
         self.composite.update_state()
@@ -229,6 +230,7 @@ class FastStepper:
         arm.joint_pos, arm.joint_vel = state.joint_position, state.joint_velocity
         arm.new_update = True
         if gripper is not None:
+            gripper.new_update = True
+        if gripper is not None and not (evaluated and self._gripper_seen and substeps == 1):
             gripper.joint_pos = state.coordinates[gripper.qpos_index]
             gripper.joint_vel = state.coordinates[self.model.nq :][gripper.qvel_index]
-            gripper.new_update = True
