@@ -54,8 +54,6 @@ class Robot(NamedTuple):
     lite: bool  # physics in two halves, robosuite's default
     arm_lite: bool  # the controller does not evaluate the physics again
     site: int  # end-effector
-    base: int  # site whose frame the goal is in; -1 if it never moves
-    base_frame: bool  # the goal is in that frame, and not in the world's
     dof: int  # first of the arm's in qvel
     joint: int  # first of the arm's in qpos
     actuator: int  # first of the arm's in ctrl
@@ -68,7 +66,6 @@ class Robot(NamedTuple):
     limits: np.ndarray  # (nu, 2), of ctrl
     site_position: np.ndarray
     site_rotation: np.ndarray
-    base_position: np.ndarray
 
 
 class Arm(NamedTuple):
@@ -93,12 +90,6 @@ class Scratch(NamedTuple):
 
     jacobian_position: np.ndarray  # (3, nv)
     jacobian_rotation: np.ndarray  # (3, nv)
-    base_jacobian_position: np.ndarray  # (3, nv)
-    base_jacobian_rotation: np.ndarray  # (3, nv)
-    base_velocity: np.ndarray  # (3,)
-    base_angular_velocity: np.ndarray  # (3,)
-    goal_offset: np.ndarray  # (3,), of the goal from the base
-    goal_rotation: np.ndarray  # (3, 3), world
     mass: np.ndarray  # (nv, nv)
     lambda_position: np.ndarray  # (3, 3)
     lambda_rotation: np.ndarray  # (3, 3)
@@ -115,10 +106,23 @@ class Products(NamedTuple):
     force: int
     torque: int
     joint_torque: int
-    base_velocity: int
-    base_angular_velocity: int
-    goal_offset: int
-    goal_rotation: int
+
+
+class Base(NamedTuple):
+    """The site whose frame goals are in, where it moves with the arm."""
+
+    site: int
+    goal_is_local: bool  # in that frame, and not in the world's
+    position: np.ndarray  # (3,), view of MuJoCo's
+    jacobian_position: np.ndarray  # (3, nv)
+    jacobian_rotation: np.ndarray  # (3, nv)
+    velocity: np.ndarray  # (3,)
+    angular_velocity: np.ndarray  # (3,)
+    goal_offset: np.ndarray  # (3,), of the goal from the site
+    velocity_product: int  # addresses, as of Products
+    angular_velocity_product: int
+    goal_offset_product: int
+    goal_rotation_product: int
 
 
 class Goal(NamedTuple):
@@ -155,6 +159,7 @@ def control_period(
     scratch: Scratch,
     products: Products,
     goal: Goal,
+    base: Base | None,
 ) -> None:
     """``OperationalSpaceController.run_controller`` and the physics, ``substeps`` times.
 
@@ -192,29 +197,29 @@ def control_period(
             arm.jacobian[3:] = arm.jacobian_rotation
             arm.joint_position[:] = robot.qpos[joints]
             arm.joint_velocity[:] = robot.qvel[dofs]
-        if robot.base >= 0:
+        if base is not None:
             _mj_jac_site(
                 robot.model,
                 robot.data,
-                scratch.base_jacobian_position.ctypes.data,
-                scratch.base_jacobian_rotation.ctypes.data,
-                robot.base,
+                base.jacobian_position.ctypes.data,
+                base.jacobian_rotation.ctypes.data,
+                base.site,
             )
-            _numpy_dot(robot.dot, products.base_velocity)
-            _numpy_dot(robot.dot, products.base_angular_velocity)
-            if robot.base_frame:
-                _numpy_dot(robot.dot, products.goal_offset)
-                _numpy_dot(robot.dot, products.goal_rotation)
-                goal.position[:] = robot.base_position + scratch.goal_offset
-                goal.rotation[:] = scratch.goal_rotation
+            _numpy_dot(robot.dot, base.velocity_product)
+            _numpy_dot(robot.dot, base.angular_velocity_product)
+            if base.goal_is_local:
+                _numpy_dot(robot.dot, base.goal_offset_product)
+                _numpy_dot(robot.dot, base.goal_rotation_product)
+                goal.position[:] = base.position + base.goal_offset
         error = orientation_error(goal.rotation, arm.rotation)
         for i in range(3):
-            slowing = -(arm.velocity[i] - scratch.base_velocity[i])
+            slowing, turning = arm.velocity[i], arm.angular_velocity[i]
+            if base is not None:
+                slowing, turning = slowing - base.velocity[i], turning - base.angular_velocity[i]
             scratch.force[i] = (goal.position[i] - arm.position[i]) * goal.kp[i] + (
-                slowing * goal.kd[i]
+                -slowing * goal.kd[i]
             )
-            slowing = -(arm.angular_velocity[i] - scratch.base_angular_velocity[i])
-            scratch.torque[i] = error[i] * goal.kp[i + 3] + slowing * goal.kd[i + 3]
+            scratch.torque[i] = error[i] * goal.kp[i + 3] + (-turning * goal.kd[i + 3])
         _, lambda_position, lambda_rotation, nullspace = opspace_matrices(
             arm.mass, arm.jacobian, arm.jacobian_position, arm.jacobian_rotation
         )

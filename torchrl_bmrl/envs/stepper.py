@@ -13,6 +13,7 @@ import numpy as np
 from torchrl_bmrl.envs.control_period import (
     DOT,
     Arm,
+    Base,
     Goal,
     Products,
     Robot,
@@ -69,10 +70,6 @@ class FastStepper:
         indices = self.robot._ref_actuators_indexes_dict
         fingers = [] if self.gripper is None else indices[f"{name}_gripper"]
         site = model.site(arm.ref_name).id
-        base = model.site(f"{arm.naming_prefix}{arm.part_name}_center")
-        # On some arms, such as IIWA, the controller's frame turns with the first joint.
-        moves = bool(model.body_weldid[base.bodyid[0]] != 0)
-        base_rotation = data.site_xmat[base.id].reshape(3, 3)
         self._robot = Robot(
             model=model._address,
             data=data._address,
@@ -80,8 +77,6 @@ class FastStepper:
             lite=bool(env.lite_physics),
             arm_lite=bool(arm.lite_physics),
             site=site,
-            base=base.id if moves else -1,
-            base_frame=arm.input_ref_frame == "base",
             dof=int(arm.qvel_index[0]),
             joint=int(arm.qpos_index[0]),
             actuator=int(indices[name][0]),
@@ -94,7 +89,6 @@ class FastStepper:
             limits=model.actuator_ctrlrange,
             site_position=data.site_xpos[site],
             site_rotation=data.site_xmat[site].reshape(3, 3),
-            base_position=data.site_xpos[base.id],
         )
         self._arm = Arm(
             mass=np.zeros((n, n), order="F"),
@@ -114,12 +108,6 @@ class FastStepper:
         scratch = self._scratch = Scratch(
             jacobian_position=np.zeros((3, model.nv)),
             jacobian_rotation=np.zeros((3, model.nv)),
-            base_jacobian_position=np.zeros((3, model.nv)),
-            base_jacobian_rotation=np.zeros((3, model.nv)),
-            base_velocity=np.zeros(3),
-            base_angular_velocity=np.zeros(3),
-            goal_offset=np.zeros(3),
-            goal_rotation=np.zeros((3, 3)),
             mass=np.zeros((model.nv, model.nv)),
             lambda_position=np.zeros((3, 3), order="F"),
             lambda_rotation=np.zeros((3, 3), order="F"),
@@ -127,7 +115,6 @@ class FastStepper:
             torque=np.zeros(3),
             joint_torque=np.zeros(n),
         )
-        self._local_position, self._local_rotation = np.zeros(3), np.zeros((3, 3))
         # Kept alive, like the model and the data.
         self._arguments = {
             "velocity": (scratch.jacobian_position, data.qvel, arm.ref_pos_vel),
@@ -135,16 +122,46 @@ class FastStepper:
             "force": (scratch.lambda_position, scratch.force, wrench[:3]),
             "torque": (scratch.lambda_rotation, scratch.torque, wrench[3:]),
             "joint_torque": (arm.J_full.T, wrench, scratch.joint_torque),
-            "base_velocity": (scratch.base_jacobian_position, data.qvel, scratch.base_velocity),
-            "base_angular_velocity": (
-                scratch.base_jacobian_rotation,
-                data.qvel,
-                scratch.base_angular_velocity,
-            ),
-            "goal_offset": (base_rotation, self._local_position, scratch.goal_offset),
-            "goal_rotation": (base_rotation, self._local_rotation, scratch.goal_rotation),
         }
         self._products = Products(**{name: id(each) for name, each in self._arguments.items()})
+        self._goal_is_local = arm.input_ref_frame == "base"
+        self._rotation = np.zeros((3, 3))
+        self._base = self._moving_base()
+
+    def _moving_base(self) -> Base | None:
+        """Where the controller's frame moves; IIWA's turns with the first joint."""
+        arm, model, data = self.arm, self.model, self.data
+        site = model.site(f"{arm.naming_prefix}{arm.part_name}_center")
+        if model.body_weldid[site.bodyid[0]] == 0:
+            return None
+        frame = data.site_xmat[site.id].reshape(3, 3)
+        self._local_position, self._local_rotation = np.zeros(3), np.zeros((3, 3))
+        jacobians, (velocity, angular_velocity, offset) = (
+            np.zeros((2, 3, model.nv)),
+            np.zeros((3, 3)),
+        )
+        # Kept alive, like the others.
+        self._base_arguments = (
+            (jacobians[0], data.qvel, velocity),
+            (jacobians[1], data.qvel, angular_velocity),
+            (frame, self._local_position, offset),
+            (frame, self._local_rotation, self._rotation),
+        )
+        of_velocity, of_angular_velocity, of_offset, of_rotation = map(id, self._base_arguments)
+        return Base(
+            site=site.id,
+            goal_is_local=self._goal_is_local,
+            position=data.site_xpos[site.id],
+            jacobian_position=jacobians[0],
+            jacobian_rotation=jacobians[1],
+            velocity=velocity,
+            angular_velocity=angular_velocity,
+            goal_offset=offset,
+            velocity_product=of_velocity,
+            angular_velocity_product=of_angular_velocity,
+            goal_offset_product=of_offset,
+            goal_rotation_product=of_rotation,
+        )
 
     def serves(self, env: MujocoEnv) -> bool:
         """Whether ``env`` has the same simulator, controllers and settings as at the start."""
@@ -155,7 +172,7 @@ class FastStepper:
             and self.arm in self.composite.part_controllers.values()
             and self._robot.lite == env.lite_physics
             and self._robot.arm_lite == self.arm.lite_physics
-            and self._robot.base_frame == (self.arm.input_ref_frame == "base")
+            and self._goal_is_local == (self.arm.input_ref_frame == "base")
             and settings_obstacle(env) is None
         )
 
@@ -196,14 +213,16 @@ class FastStepper:
         finally:  # as it was, should the action be refused
             arm.new_update = not self.seen
         position, rotation = arm.goal_pos, arm.goal_ori
-        if robot.base_frame:
-            self._local_position[:], self._local_rotation[:] = position, rotation
+        if self._goal_is_local:
+            if self._base is not None:
+                self._local_position[:], self._local_rotation[:] = position, rotation
             position = arm.origin_pos + np.dot(arm.origin_ori, position)
             rotation = np.dot(arm.origin_ori, rotation)
+        self._rotation[:] = rotation
         self._evaluated = True
         self._goal = Goal(
             position=np.array(position, dtype=np.float64),
-            rotation=np.array(rotation, dtype=np.float64, order="C"),
+            rotation=self._rotation,
             kp=np.asarray(arm.kp, dtype=np.float64),
             kd=np.asarray(arm.kd, dtype=np.float64),
             rest=np.array(arm.initial_joint, dtype=np.float64),
@@ -223,6 +242,7 @@ class FastStepper:
             self._scratch,
             self._products,
             self._goal,
+            self._base,
         )
         self._evaluated = False
         arm, gripper = self.arm, self.gripper
