@@ -22,12 +22,11 @@ import sys, time
 import numpy as np
 import robosuite.utils.control_utils as control
 {change}
-from torchrl_bmrl.envs.sawyer import SawyerEnv
+from torchrl_bmrl.envs.tabletop import STEPPERS, TabletopEnv
 from torchrl_bmrl.envs.control_period import control_period
-from torchrl_bmrl.names import STEPPERS
 joints = []
 for stepper in STEPPERS:
-    env = SawyerEnv("reach", stepper=stepper)
+    env = TabletopEnv("reach", stepper=stepper)
     env.reset(seed=0)
     started = time.monotonic()
     for _ in range(10):

@@ -58,8 +58,8 @@ MISSING_LIBRARY = """
 import sys, warnings
 import mujoco
 mujoco.__version__ = "3.7.77"
-from torchrl_bmrl.envs.sawyer import SawyerEnv
-env = SawyerEnv("reach")
+from torchrl_bmrl.envs.tabletop import TabletopEnv
+env = TabletopEnv("reach")
 env.reset(seed=0)
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
@@ -93,7 +93,7 @@ def test_a_mujoco_that_robosuite_fails_with_is_refused_in_one_line(version: str)
 UNSUPPORTED = """
 import mujoco
 mujoco.__version__ = "4.0.0"
-import torchrl_bmrl.envs.sawyer
+import torchrl_bmrl.envs.tabletop
 """
 
 

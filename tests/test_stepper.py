@@ -14,41 +14,42 @@ pytest.importorskip("robosuite", exc_type=ImportError)
 import mujoco
 from robosuite.controllers import load_composite_controller_config
 
-from torchrl_bmrl.envs import sawyer
-from torchrl_bmrl.envs.sawyer import SawyerEnv
+from torchrl_bmrl.envs import tabletop
+from torchrl_bmrl.envs.lean import without_pictures
+from torchrl_bmrl.envs.scene import TabletopScene
+from torchrl_bmrl.envs.skills import SKILLS
 from torchrl_bmrl.envs.stepper import FastStepper
-from torchrl_bmrl.envs.tasks import make_robosuite_env, without_pictures
+from torchrl_bmrl.envs.tabletop import STEPPERS, TabletopEnv
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.experts.controllers import make_expert
-from torchrl_bmrl.names import HORIZON, STEPPERS, TASKS
 
 pytestmark = pytest.mark.robosuite
 
 Act = Callable[[], np.ndarray]
 
 
-def random_actions(env: SawyerEnv, seed: int) -> Act:
+def random_actions(env: TabletopEnv, seed: int) -> Act:
     rng = np.random.default_rng(seed)
     return lambda: rng.uniform(-1, 1, 7)
 
 
-def zero_actions(env: SawyerEnv, seed: int) -> Act:
+def zero_actions(env: TabletopEnv, seed: int) -> Act:
     return lambda: np.zeros(7)
 
 
-def held_saturated_actions(env: SawyerEnv, seed: int) -> Act:
+def held_saturated_actions(env: TabletopEnv, seed: int) -> Act:
     """Full speed one way: into the table, the joints' limits and singular poses."""
     action = np.sign(np.random.default_rng(seed + 7).standard_normal(7))
     return lambda: action
 
 
-def switching_saturated_actions(env: SawyerEnv, seed: int) -> Act:
+def switching_saturated_actions(env: TabletopEnv, seed: int) -> Act:
     rng = np.random.default_rng(seed)
     return lambda: np.sign(rng.standard_normal(7))
 
 
-def expert_actions(env: SawyerEnv, seed: int) -> Act:
-    expert, rng = make_expert(env.task, env.robosuite_env), np.random.default_rng(seed)
+def expert_actions(env: TabletopEnv, seed: int) -> Act:
+    expert, rng = make_expert(env.robosuite_env), np.random.default_rng(seed)
     return lambda: np.clip(expert() + 0.2 * rng.standard_normal(7), -1, 1)
 
 
@@ -62,13 +63,13 @@ ACTIONS = [
 
 
 @pytest.fixture(scope="module")
-def pairs() -> Iterator[Callable[[str], tuple[SawyerEnv, SawyerEnv]]]:
+def pairs() -> Iterator[Callable[[str], tuple[TabletopEnv, TabletopEnv]]]:
     """robosuite's own model and step, and the fast one's, of a task."""
-    made: dict[str, tuple[SawyerEnv, SawyerEnv]] = {}
+    made: dict[str, tuple[TabletopEnv, TabletopEnv]] = {}
 
-    def pair(task: str) -> tuple[SawyerEnv, SawyerEnv]:
+    def pair(task: str) -> tuple[TabletopEnv, TabletopEnv]:
         if task not in made:
-            made[task] = SawyerEnv(task, stepper="robosuite"), SawyerEnv(task)
+            made[task] = TabletopEnv(task, stepper="robosuite"), TabletopEnv(task)
         return made[task]
 
     yield pair
@@ -77,14 +78,14 @@ def pairs() -> Iterator[Callable[[str], tuple[SawyerEnv, SawyerEnv]]]:
             env.close()
 
 
-def everything(env: SawyerEnv) -> list[np.ndarray]:
+def everything(env: TabletopEnv) -> list[np.ndarray]:
     """What MuJoCo holds of the state and of what follows from it."""
     data = env.robosuite_env.sim.data._data
     names = ("qpos", "qvel", "qacc", "ctrl", "qfrc_bias", "site_xpos", "site_xmat", "xpos")
     return [np.array(getattr(data, name)) for name in names] + [np.array([data.time, data.ncon])]
 
 
-def assert_same_steps(reference: SawyerEnv, env: SawyerEnv, act: Act, steps: int) -> None:
+def assert_same_steps(reference: TabletopEnv, env: TabletopEnv, act: Act, steps: int) -> None:
     start = everything(reference)
     for _ in range(steps):
         action = act()
@@ -100,14 +101,14 @@ def assert_same_steps(reference: SawyerEnv, env: SawyerEnv, act: Act, steps: int
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("actions", ACTIONS, ids=lambda actions: actions.__name__)
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", SKILLS)
 def test_every_number_of_an_episode_equals_robosuites(
     pairs: Any, task: str, actions: Callable[..., Act], seed: int
 ) -> None:
     reference, env = pairs(task)
     for one in (reference, env):
         one.reset(seed=seed)
-    assert_same_steps(reference, env, actions(reference, seed), HORIZON)
+    assert_same_steps(reference, env, actions(reference, seed), 200)
     assert env._fast is not None
     assert reference._fast is None
 
@@ -149,11 +150,11 @@ def test_reset_of_the_robosuite_environment_itself_is_noticed(pairs: Any) -> Non
 # -- controllers -----------------------------------------------------------------------------------
 
 
-def made_with(changes: dict[str, Any]) -> list[SawyerEnv]:
+def made_with(changes: dict[str, Any]) -> list[TabletopEnv]:
     """A fast and a stock environment, reset, with another configuration of the arm's controller."""
     config = load_composite_controller_config(robot="Sawyer")
     config["body_parts"]["right"].update(changes)
-    envs = [SawyerEnv("lift", stepper=name, controller_configs=config) for name in STEPPERS]
+    envs = [TabletopEnv("lift", stepper=name, controller_configs=config) for name in STEPPERS]
     for env in envs:
         env.reset(seed=1)
         env.action_space.seed(1)
@@ -197,7 +198,7 @@ def test_other_operational_space_controllers_are_covered(name: str) -> None:
 def test_a_controller_that_is_not_covered_takes_robosuites_step_and_says_so_once(
     reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sawyer, "_said", set())
+    monkeypatch.setattr(tabletop, "_warned", set())
     fast, reference = made_with(NOT_COVERED[reason])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -214,14 +215,14 @@ def test_a_controller_that_is_not_covered_takes_robosuites_step_and_says_so_once
 
 def test_an_unknown_stepper_is_answered_with_the_valid_ones() -> None:
     with pytest.raises(UnknownNameError, match=r"'numpy'.*fast, robosuite"):
-        SawyerEnv("lift", stepper="numpy")
+        TabletopEnv("lift", stepper="numpy")
 
 
 # -- the lean model --------------------------------------------------------------------------------
 
 
 def test_the_lean_model_has_a_thousandth_of_the_size_and_all_that_collides() -> None:
-    env = make_robosuite_env("lift")
+    env = TabletopScene("lift")
     full = mujoco.MjModel.from_xml_string(env.scene_xml())
     lean = mujoco.MjModel.from_xml_string(without_pictures(env.scene_xml()))
     env.close()

@@ -28,7 +28,7 @@ from contextlib import closing
 from pathlib import Path
 from statistics import median
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -36,14 +36,15 @@ import robosuite
 import torch
 
 from torchrl_bmrl.envs.acceleration import accelerate_robosuite
-from torchrl_bmrl.envs.sawyer import SawyerEnv
+from torchrl_bmrl.envs.skills import SKILLS
+from torchrl_bmrl.envs.tabletop import STEPPERS, TabletopEnv
 from torchrl_bmrl.envs.transforms import make_env
 from torchrl_bmrl.evaluation.rollout import evaluate_policy
 from torchrl_bmrl.experts.collect import collect_demonstrations
 from torchrl_bmrl.experts.controllers import make_expert
 from torchrl_bmrl.modules import BCQPolicy
-from torchrl_bmrl.names import HORIZON, STEPPERS, TASKS
 from torchrl_bmrl.pipeline.agents import make_bcq_loss
+from torchrl_bmrl.tasks import get_task
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 STOCK = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "Wipe")
@@ -60,63 +61,77 @@ def seconds(call: Callable[[], object]) -> float:
 def stock_table(rounds: int, steps: int = 25) -> None:
     """Control steps per second of robosuite's environments, stock and accelerated.
 
-    All rounds are the same episodes, and the fastest round counts of each step: that is the time on
-    a machine which nobody else uses at that moment.
+    All rounds are the same episodes, and the fastest round counts of each step: that is its time
+    while nobody else uses the machine. The ceiling is what infinitely fast Python would reach.
     """
-    print("\n| Environment | arm | stock | fast | fast / stock | equal to the bit |\n"
-          "|---|---|---:|---:|---:|---|")  # fmt: skip
+    print("\n| Environment | arm | stock | fast | fast / stock | ceiling | equal to the bit |\n"
+          "|---|---|---:|---:|---:|---:|---|")  # fmt: skip
     for task in STOCK:
         for arm in ARMS:
-            stock, fast = envs = [stock_environment(task, arm) for _ in range(2)]
-            accelerate_robosuite(fast)
+            envs = [stock_environment(task, arm) for _ in range(2)]
+            accelerate_robosuite(envs[1])
             for env in envs:
-                play_stock(env, 0, 2)  # compiled, and in the caches
-            times: list[list[np.ndarray]] = [[], []]
+                play_stock(env, 2)  # compiled, and in the caches
+            times: list[list[np.ndarray]] = [[], [], []]
             equal = True
             for _ in range(rounds):
-                results = [play_stock(env, 1, steps) for env in envs]
-                for each, (seconds_of_steps, _) in zip(times, results, strict=True):
-                    each.append(seconds_of_steps)
-                equal = equal and results[0][1] == results[1][1]
-            theirs, ours = (float(np.min(each, axis=0).mean()) for each in times)
-            print(f"| {task} | {arm} | {1 / theirs:.0f} | {1 / ours:.0f} | {theirs / ours:.2f} | "
-                  f"{'yes' if equal else 'no'} |", flush=True)  # fmt: skip
-            del stock, fast, envs
+                theirs, ours = (play_stock(env, steps) for env in envs)
+                equal = equal and theirs.outcome == ours.outcome
+                physics = np.array(bare(envs[0], theirs.states))
+                for each, found in zip(times, (theirs.times, ours.times, physics), strict=True):
+                    each.append(found)
+            stock, fast, physics = (np.min(each, axis=0).mean() for each in times)
+            print(f"| {task} | {arm} | {1 / stock:.0f} | {1 / fast:.0f} | {stock / fast:.2f} | "
+                  f"{stock / physics:.1f} | {'yes' if equal else 'no'} |", flush=True)  # fmt: skip
 
 
 def stock_environment(task: str, arm: str) -> Any:
     """robosuite's environment without pictures, otherwise with its defaults and shaped rewards."""
     env = robosuite.make(
         task, robots=arm, use_camera_obs=False, has_offscreen_renderer=False, reward_shaping=True,
-        ignore_done=True, seed=0,
+        ignore_done=True, hard_reset=False, seed=0,
     )  # fmt: skip
     env.early_terminations = False  # Wipe ends at the first collision otherwise
     return env
 
 
-def play_stock(env: Any, seed: int, steps: int) -> tuple[np.ndarray, list[bytes]]:
-    """Times of the steps of three episodes, and all that came out of them."""
-    rng, outcome, times = np.random.default_rng(seed), [], []
+class Played(NamedTuple):
+    """Three episodes: each step's time and start, and everything that came out of them."""
+
+    times: np.ndarray
+    states: list[np.ndarray]
+    outcome: list[bytes]
+
+
+def play_stock(env: Any, steps: int) -> Played:
+    """Plays an episode each of random, saturated and still actions; every call plays the same."""
+    rng = np.random.default_rng(1)
     env.rng.bit_generator.state = rng.bit_generator.state
     held = np.sign(rng.standard_normal(env.action_dim))
-    for actions in (
-        rng.uniform(-1, 1, (steps, env.action_dim)),
-        np.tile(held, (steps, 1)),
-        np.zeros((steps, env.action_dim)),
+    played = Played(np.empty(3 * steps), [], [])
+    for number, actions in enumerate(
+        (
+            rng.uniform(-1, 1, (steps, env.action_dim)),
+            np.tile(held, (steps, 1)),
+            np.zeros((steps, env.action_dim)),
+        )
     ):
         env.reset()
-        for action in actions:
+        for step, action in enumerate(actions):
+            model, data = env.sim.model._model, env.sim.data._data
+            state = np.empty(mujoco.mj_stateSize(model, STATE))
+            mujoco.mj_getState(model, data, state, STATE)
             start = perf_counter()
             observation, reward, done, info = env.step(action)
-            times.append(perf_counter() - start)
-            data = env.sim.data._data
+            played.times[number * steps + step] = perf_counter() - start
+            played.states.append(state)
             arrays = [*observation.values(), data.qpos, data.qvel, data.act, data.ctrl, reward]
-            outcome += [np.asarray(array).tobytes() for array in arrays]
-            outcome.append(repr((done, info)).encode())
-    return np.array(times), outcome
+            played.outcome.extend(np.asarray(array).tobytes() for array in arrays)
+            played.outcome.append(repr((done, info)).encode())
+    return played
 
 
-def episode(env: SawyerEnv, steps: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def episode(env: TabletopEnv, steps: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Actions of a noisy expert, and the states in which they were taken."""
     env.reset(seed=0)
     expert, rng = make_expert(env.robosuite_env), np.random.default_rng(0)
@@ -134,10 +149,10 @@ def play(env: TabletopEnv, actions: list[np.ndarray]) -> float:
     return sum(seconds(lambda: env.step(action)) for action in actions)  # noqa: B023
 
 
-def bare(env: TabletopEnv, states: list[np.ndarray]) -> float:
-    """Time of the physics alone from the same states."""
-    model, data = env.robosuite_env.sim.model._model, env.robosuite_env.sim.data._data
-    substeps, total = int(0.05 / model.opt.timestep), 0.0
+def bare(env: Any, states: list[np.ndarray]) -> list[float]:
+    """Times of robosuite's physics alone from the same states."""
+    model, data = env.sim.model._model, env.sim.data._data
+    substeps, times = int(0.05 / model.opt.timestep), []
 
     def advance() -> None:
         for _ in range(substeps):
@@ -146,20 +161,24 @@ def bare(env: TabletopEnv, states: list[np.ndarray]) -> float:
 
     for state in states:
         mujoco.mj_setState(model, data, state, STATE)
-        total += seconds(advance)
-    return total
+        times.append(seconds(advance))
+    return times
 
 
-def step_table(rounds: int, steps: int = HORIZON) -> None:
+def step_table(rounds: int, steps: int = 200) -> None:
     """Control steps per second of one process, per task."""
     print("\n| Task | robosuite | fast | bare, robosuite's model | bare, lean | fast / robosuite |"
           " fast / bare (robosuite's, lean) |\n|---|---:|---:|---:|---:|---:|---:|")  # fmt: skip
-    for task in TASKS:
+    for task in SKILLS:
         stock, fast = (TabletopEnv(task, stepper=name) for name in reversed(STEPPERS))
         actions, states = episode(fast, steps)
         play(stock, actions[:3])  # compiled, and in the caches
         times = [
-            (play(stock, actions), play(fast, actions), bare(stock, states), bare(fast, states))
+            (
+                play(stock, actions),
+                play(fast, actions),
+                *(sum(bare(env.robosuite_env, states)) for env in (stock, fast)),
+            )
             for _ in range(rounds)
         ]
         speeds = [steps / min(column) for column in zip(*times, strict=True)]
@@ -176,13 +195,16 @@ def worker_table(episodes: int) -> None:
     for stepper in STEPPERS:
         for workers in (1, 2):
             with tempfile.TemporaryDirectory() as folder:
-                options = {"noise": 0.2, "seed": 0, "workers": workers, "stepper": stepper}
+                task = get_task("lift").with_options(stepper=stepper)
                 time = seconds(
                     lambda: collect_demonstrations(
                         Path(folder),
+                        [task],  # noqa: B023
                         {"lift": episodes - 1},
                         valid_episodes=1,
-                        **options,  # noqa: B023
+                        noise=0.2,
+                        seed=0,
+                        workers=workers,  # noqa: B023
                     )
                 )
             print(f"| {stepper} | {workers} | {episodes} | {time:.1f} | {episodes / time:.2f} |",
@@ -191,7 +213,7 @@ def worker_table(episodes: int) -> None:
 
 def policy_table(steps: int = 50) -> None:
     """Time of a step of one episode, a policy of 100 candidates included."""
-    policy = BCQPolicy.frozen(make_bcq_loss())
+    policy = BCQPolicy.frozen(make_bcq_loss(observation_dim=33, action_dim=7))
     print("\n| Stepper | episodes side by side | ms per step of an episode |\n|---|---:|---:|")
     for stepper in STEPPERS:
         for number in (None, 1, 4, 20):
@@ -223,11 +245,12 @@ import sys
 from pathlib import Path
 def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4 / 1024
-from torchrl_bmrl.experts import collect
-from torchrl_bmrl.experts.controllers import ExpertGains
+import numpy as np
+from torchrl_bmrl.tasks import get_task
 before = resident()
-for task in ("lift", "push_left"):
-    collect.collect_episode(task, 0, noise=0.2, gains=ExpertGains(), stepper=sys.argv[1])
+for name in ("lift", "push_left"):
+    task = get_task(name).with_options(stepper=sys.argv[1])
+    task.record(task.options, rng=np.random.default_rng(0), noise=0.2)
 print(f"{before:.0f} | {resident():.0f}")
 """
 
