@@ -245,12 +245,11 @@ import sys
 from pathlib import Path
 def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4 / 1024
-import numpy as np
 from torchrl_bmrl.tasks import get_task
 before = resident()
 for name in ("lift", "push_left"):
     task = get_task(name).with_options(stepper=sys.argv[1])
-    task.record(task.options, rng=np.random.default_rng(0), noise=0.2)
+    task.record(0, noise=0.2, **task.options)
 print(f"{before:.0f} | {resident():.0f}")
 """
 
