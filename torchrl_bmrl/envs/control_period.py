@@ -38,7 +38,6 @@ _mj_step1 = types.ExternalFunction("mj_step1", types.void(_address, _address))
 _mj_step2 = types.ExternalFunction("mj_step2", types.void(_address, _address))
 _mj_forward = types.ExternalFunction("mj_forward", types.void(_address, _address))
 _mj_jac_site = types.ExternalFunction("mj_jacSite", types.void(*[_address] * 4, types.int32))
-_mj_full_m = types.ExternalFunction("mj_fullM", types.void(*[_address] * 3))
 _py_call = types.ExternalFunction("PyObject_Call", _address(*[_address] * 3))
 _py_decref = types.ExternalFunction("Py_DecRef", types.void(_address))
 # Without the dispatch to other libraries' arrays, which takes as long as a small product.
@@ -61,7 +60,9 @@ class Robot(NamedTuple):
     qpos: np.ndarray
     qvel: np.ndarray
     bias: np.ndarray
-    inertia: np.ndarray
+    inertia: np.ndarray  # sparse: each joint's row from the diagonal towards the base
+    inertia_start: np.ndarray  # (nv,), of the rows
+    parent: np.ndarray  # (nv,), the joint before, or -1
     ctrl: np.ndarray
     limits: np.ndarray  # (nu, 2), of ctrl
     site_position: np.ndarray
@@ -90,7 +91,6 @@ class Scratch(NamedTuple):
 
     jacobian_position: np.ndarray  # (3, nv)
     jacobian_rotation: np.ndarray  # (3, nv)
-    mass: np.ndarray  # (nv, nv)
     lambda_position: np.ndarray  # (3, 3)
     lambda_rotation: np.ndarray  # (3, 3)
     force: np.ndarray  # (3,)
@@ -150,6 +150,17 @@ def _clipped(value: float, low: float, high: float) -> float:
 
 
 @cached_njit
+def _mass_matrix(robot: Robot, mass: np.ndarray) -> None:
+    # The arm's block of what mj_fullM copies, without the zeros of all other joints.
+    n, first = len(mass), robot.dof
+    for i in range(n):
+        entry, j = robot.inertia_start[first + i], first + i
+        while j >= first:
+            mass[i, j - first] = mass[j - first, i] = robot.inertia[entry]
+            entry, j = entry + 1, robot.parent[j]
+
+
+@cached_njit
 def control_period(
     substeps: int,
     evaluated: bool,
@@ -185,10 +196,9 @@ def control_period(
                 scratch.jacobian_rotation.ctypes.data,
                 robot.site,
             )
-            _mj_full_m(robot.model, scratch.mass.ctypes.data, robot.inertia.ctypes.data)
             _numpy_dot(robot.dot, products.velocity)
             _numpy_dot(robot.dot, products.angular_velocity)
-            arm.mass[:] = scratch.mass[dofs, dofs]
+            _mass_matrix(robot, arm.mass)
             arm.position[:] = robot.site_position
             arm.rotation[:] = robot.site_rotation
             arm.jacobian_position[:] = scratch.jacobian_position[:, dofs]

@@ -106,4 +106,6 @@ def _model_obstacle(env: MujocoEnv) -> Obstacle | None:
     for indices in (arm.qpos_index, arm.qvel_index, robot._ref_actuators_indexes_dict[name]):
         if list(indices) != list(range(indices[0], indices[0] + arm.joint_dim)):
             return Obstacle("joints", "the arm's joints are not in a row")
+    if list(env.sim.model._model.dof_parentid[arm.qvel_index]) != [-1, *arm.qvel_index[:-1]]:
+        return Obstacle("joints", "the arm's joints are not a chain that begins at a fixed base")
     return None

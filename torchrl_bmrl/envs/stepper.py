@@ -85,6 +85,8 @@ class FastStepper:
             qvel=data.qvel,
             bias=data.qfrc_bias,
             inertia=data.qM,
+            inertia_start=model.dof_Madr,
+            parent=model.dof_parentid,
             ctrl=data.ctrl,
             limits=model.actuator_ctrlrange,
             site_position=data.site_xpos[site],
@@ -108,7 +110,6 @@ class FastStepper:
         scratch = self._scratch = Scratch(
             jacobian_position=np.zeros((3, model.nv)),
             jacobian_rotation=np.zeros((3, model.nv)),
-            mass=np.zeros((model.nv, model.nv)),
             lambda_position=np.zeros((3, 3), order="F"),
             lambda_rotation=np.zeros((3, 3), order="F"),
             force=np.zeros(3),
