@@ -192,13 +192,15 @@ class _Memory:
             start = int(np.sum(model.sensor_dim[:sensor]))
             indices += range(start, start + int(model.sensor_dim[sensor]))
         self.sensors = np.array(indices)
+        self.joints = np.array(robot._ref_joint_pos_indexes)
+        self.accelerations = np.empty((6, 10))
         self.jacobians = np.zeros((2, 3, model.nv))
         self.site = model.site(stepper.arm.ref_name).id
 
     def push(self, action: np.ndarray) -> None:
         """As ``FixedBaseRobot.control`` does after the first substep's controls are set."""
         robot, name, arm, data = self.stepper.robot, self.name, self.stepper.arm, self.stepper.data
-        robot.recent_qpos.push(robot._joint_positions)
+        robot.recent_qpos.push(data.qpos[self.joints])
         robot.recent_actions.push(action)
         robot.recent_torques.push(robot.torques)
         robot.recent_ee_forcetorques[name].push(data.sensordata[self.sensors])
@@ -212,9 +214,9 @@ class _Memory:
         robot.recent_ee_vel[name].push(velocity)
         velocities = robot.recent_ee_vel_buffer[name]
         velocities.push(velocity)
-        accelerations = np.empty((6, 10))
+        accelerations, buffer = self.accelerations, velocities.buf
         accelerations[:, 0] = robot.recent_ee_acc[name].current
-        accelerations[:, 1:] = (robot.control_freq * np.diff(velocities.buf, axis=0)).T
+        accelerations[:, 1:] = (robot.control_freq * (buffer[1:] - buffer[:-1])).T
         # np.convolve of ten with ten is one scalar product; a matrix product rounds differently.
         average = np.array([np.dot(axis, _AVERAGE) for axis in accelerations])
         robot.recent_ee_acc[name].push(average)

@@ -20,6 +20,7 @@ from torchrl_bmrl.envs.control_period import (
     Scratch,
     control_period,
 )
+from torchrl_bmrl.envs.goals import GoalSetter
 from torchrl_bmrl.envs.obstacles import settings_obstacle, why_not_fast
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.extras import needs
@@ -127,15 +128,16 @@ class FastStepper:
         self._products = Products(**{name: id(each) for name, each in self._arguments.items()})
         self._goal_is_local = arm.input_ref_frame == "base"
         self._rotation = np.zeros((3, 3))
-        self._base = self._moving_base()
+        center = model.site(f"{arm.naming_prefix}{arm.part_name}_center").id
+        base = data.site_xpos[center], data.site_xmat[center].reshape(3, 3)
+        self._goals = GoalSetter(self.composite, arm, self.gripper, *base)
+        self._base = self._moving_base(center, *base)
 
-    def _moving_base(self) -> Base | None:
+    def _moving_base(self, site: int, position: np.ndarray, rotation: np.ndarray) -> Base | None:
         """Where the controller's frame moves; IIWA's turns with the first joint."""
-        arm, model, data = self.arm, self.model, self.data
-        site = model.site(f"{arm.naming_prefix}{arm.part_name}_center")
-        if model.body_weldid[site.bodyid[0]] == 0:
+        model, data = self.model, self.data
+        if model.body_weldid[model.site_bodyid[site]] == 0:
             return None
-        frame = data.site_xmat[site.id].reshape(3, 3)
         self._local_position, self._local_rotation = np.zeros(3), np.zeros((3, 3))
         jacobians, (velocity, angular_velocity, offset) = (
             np.zeros((2, 3, model.nv)),
@@ -145,14 +147,14 @@ class FastStepper:
         self._base_arguments = (
             (jacobians[0], data.qvel, velocity),
             (jacobians[1], data.qvel, angular_velocity),
-            (frame, self._local_position, offset),
-            (frame, self._local_rotation, self._rotation),
+            (rotation, self._local_position, offset),
+            (rotation, self._local_rotation, self._rotation),
         )
         of_velocity, of_angular_velocity, of_offset, of_rotation = map(id, self._base_arguments)
         return Base(
-            site=site.id,
+            site=site,
             goal_is_local=self._goal_is_local,
-            position=data.site_xpos[site.id],
+            position=position,
             jacobian_position=jacobians[0],
             jacobian_rotation=jacobians[1],
             velocity=velocity,
@@ -208,9 +210,8 @@ class FastStepper:
         self._gripper_seen = gripper is not None and not gripper.new_update
         if gripper is not None:
             gripper.new_update = False
-        self.composite.update_state()
         try:
-            self.composite.set_goal(action)
+            self._goals.set(action)
         finally:  # as it was, should the action be refused
             arm.new_update = not self.seen
         position, rotation = arm.goal_pos, arm.goal_ori
@@ -227,7 +228,7 @@ class FastStepper:
             kp=np.asarray(arm.kp, dtype=np.float64),
             kd=np.asarray(arm.kd, dtype=np.float64),
             rest=np.array(arm.initial_joint, dtype=np.float64),
-            fingers=np.zeros(0) if gripper is None else gripper.run_controller(),
+            fingers=self._goals.fingers(),
         )
 
     def advance(self, substeps: int) -> None:
