@@ -2,10 +2,14 @@
 
     python tests/benchmarks/simulator_speed.py [--rounds 5] [--episodes 60]
 
-The ceiling is 25 bare ``mj_step1`` and ``mj_step2``, from the states of the same episode, on
-robosuite's model and on the one without pictures. Variants take turns on one thread, an expert's
-episode each; the tables hold the fastest round of each, and ratios within one round. Memory is
-resident, of a process of its own.
+First come stock robosuite's environments, accelerated and not. Both play the same episodes of
+random, saturated and still actions in turn, with shaped rewards and all observations. All returned
+numbers and MuJoCo's state are compared, and the fastest round counts of each step.
+
+Then come this package's tasks. The ceiling is 25 bare ``mj_step1`` and ``mj_step2``, from the
+states of the same episode, on robosuite's model and on the one without pictures. Variants take
+turns on one thread, an expert's episode each. The tables show the fastest round of each variant and
+the median of the rounds' ratios. Memory is resident, of a process of its own.
 """
 
 from __future__ import annotations
@@ -24,11 +28,14 @@ from contextlib import closing
 from pathlib import Path
 from statistics import median
 from time import perf_counter
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+import robosuite
 import torch
 
+from torchrl_bmrl.envs.acceleration import accelerate_robosuite
 from torchrl_bmrl.envs.skills import SKILLS
 from torchrl_bmrl.envs.tabletop import STEPPERS, TabletopEnv
 from torchrl_bmrl.envs.transforms import make_env
@@ -40,6 +47,8 @@ from torchrl_bmrl.pipeline.agents import make_bcq_loss
 from torchrl_bmrl.tasks import get_task
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+STOCK = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "Wipe")
+ARMS = ("Panda", "Sawyer", "UR5e")
 
 
 def seconds(call: Callable[[], object]) -> float:
@@ -47,6 +56,79 @@ def seconds(call: Callable[[], object]) -> float:
     start = perf_counter()
     call()
     return perf_counter() - start
+
+
+def stock_table(rounds: int, steps: int = 25) -> None:
+    """Control steps per second of robosuite's environments, stock and accelerated.
+
+    All rounds are the same episodes, and the fastest round counts of each step: that is its time
+    while nobody else uses the machine. The ceiling is what infinitely fast Python would reach.
+    """
+    print("\n| Environment | arm | stock | fast | fast / stock | ceiling | equal to the bit |\n"
+          "|---|---|---:|---:|---:|---:|---|")  # fmt: skip
+    for task in STOCK:
+        for arm in ARMS:
+            envs = [stock_environment(task, arm) for _ in range(2)]
+            accelerate_robosuite(envs[1])
+            for env in envs:
+                play_stock(env, 2)  # compiled, and in the caches
+            times: list[list[np.ndarray]] = [[], [], []]
+            equal = True
+            for _ in range(rounds):
+                theirs, ours = (play_stock(env, steps) for env in envs)
+                equal = equal and theirs.outcome == ours.outcome
+                physics = np.array(bare(envs[0], theirs.states))
+                for each, found in zip(times, (theirs.times, ours.times, physics), strict=True):
+                    each.append(found)
+            stock, fast, physics = (np.min(each, axis=0).mean() for each in times)
+            print(f"| {task} | {arm} | {1 / stock:.0f} | {1 / fast:.0f} | {stock / fast:.2f} | "
+                  f"{stock / physics:.1f} | {'yes' if equal else 'no'} |", flush=True)  # fmt: skip
+
+
+def stock_environment(task: str, arm: str) -> Any:
+    """robosuite's environment without pictures, otherwise with its defaults and shaped rewards."""
+    env = robosuite.make(
+        task, robots=arm, use_camera_obs=False, has_offscreen_renderer=False, reward_shaping=True,
+        ignore_done=True, hard_reset=False, seed=0,
+    )  # fmt: skip
+    env.early_terminations = False  # Wipe ends at the first collision otherwise
+    return env
+
+
+class Played(NamedTuple):
+    """Three episodes: each step's time and start, and everything that came out of them."""
+
+    times: np.ndarray
+    states: list[np.ndarray]
+    outcome: list[bytes]
+
+
+def play_stock(env: Any, steps: int) -> Played:
+    """Plays an episode each of random, saturated and still actions; every call plays the same."""
+    rng = np.random.default_rng(1)
+    env.rng.bit_generator.state = rng.bit_generator.state
+    held = np.sign(rng.standard_normal(env.action_dim))
+    played = Played(np.empty(3 * steps), [], [])
+    for number, actions in enumerate(
+        (
+            rng.uniform(-1, 1, (steps, env.action_dim)),
+            np.tile(held, (steps, 1)),
+            np.zeros((steps, env.action_dim)),
+        )
+    ):
+        env.reset()
+        for step, action in enumerate(actions):
+            model, data = env.sim.model._model, env.sim.data._data
+            state = np.empty(mujoco.mj_stateSize(model, STATE))
+            mujoco.mj_getState(model, data, state, STATE)
+            start = perf_counter()
+            observation, reward, done, info = env.step(action)
+            played.times[number * steps + step] = perf_counter() - start
+            played.states.append(state)
+            arrays = [*observation.values(), data.qpos, data.qvel, data.act, data.ctrl, reward]
+            played.outcome.extend(np.asarray(array).tobytes() for array in arrays)
+            played.outcome.append(repr((done, info)).encode())
+    return played
 
 
 def episode(env: TabletopEnv, steps: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -67,10 +149,10 @@ def play(env: TabletopEnv, actions: list[np.ndarray]) -> float:
     return sum(seconds(lambda: env.step(action)) for action in actions)  # noqa: B023
 
 
-def bare(env: TabletopEnv, states: list[np.ndarray]) -> float:
-    """Time of the physics alone from the same states."""
-    model, data = env.robosuite_env.sim.model._model, env.robosuite_env.sim.data._data
-    substeps, total = int(0.05 / model.opt.timestep), 0.0
+def bare(env: Any, states: list[np.ndarray]) -> list[float]:
+    """Times of robosuite's physics alone from the same states."""
+    model, data = env.sim.model._model, env.sim.data._data
+    substeps, times = int(0.05 / model.opt.timestep), []
 
     def advance() -> None:
         for _ in range(substeps):
@@ -79,8 +161,8 @@ def bare(env: TabletopEnv, states: list[np.ndarray]) -> float:
 
     for state in states:
         mujoco.mj_setState(model, data, state, STATE)
-        total += seconds(advance)
-    return total
+        times.append(seconds(advance))
+    return times
 
 
 def step_table(rounds: int, steps: int = 200) -> None:
@@ -92,7 +174,11 @@ def step_table(rounds: int, steps: int = 200) -> None:
         actions, states = episode(fast, steps)
         play(stock, actions[:3])  # compiled, and in the caches
         times = [
-            (play(stock, actions), play(fast, actions), bare(stock, states), bare(fast, states))
+            (
+                play(stock, actions),
+                play(fast, actions),
+                *(sum(bare(env.robosuite_env, states)) for env in (stock, fast)),
+            )
             for _ in range(rounds)
         ]
         speeds = [steps / min(column) for column in zip(*times, strict=True)]
@@ -109,15 +195,16 @@ def worker_table(episodes: int) -> None:
     for stepper in STEPPERS:
         for workers in (1, 2):
             with tempfile.TemporaryDirectory() as folder:
-                options = {"noise": 0.2, "seed": 0, "workers": workers}
-                lift = get_task("lift").with_options(stepper=stepper)
+                task = get_task("lift").with_options(stepper=stepper)
                 time = seconds(
                     lambda: collect_demonstrations(
                         Path(folder),
-                        [lift],  # noqa: B023
+                        [task],  # noqa: B023
                         {"lift": episodes - 1},
                         valid_episodes=1,
-                        **options,  # noqa: B023
+                        noise=0.2,
+                        seed=0,
+                        workers=workers,  # noqa: B023
                     )
                 )
             print(f"| {stepper} | {workers} | {episodes} | {time:.1f} | {episodes / time:.2f} |",
@@ -126,7 +213,7 @@ def worker_table(episodes: int) -> None:
 
 def policy_table(steps: int = 50) -> None:
     """Time of a step of one episode, a policy of 100 candidates included."""
-    policy = BCQPolicy.frozen(make_bcq_loss())
+    policy = BCQPolicy.frozen(make_bcq_loss(observation_dim=33, action_dim=7))
     print("\n| Stepper | episodes side by side | ms per step of an episode |\n|---|---:|---:|")
     for stepper in STEPPERS:
         for number in (None, 1, 4, 20):
@@ -160,8 +247,9 @@ def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4 / 1024
 from torchrl_bmrl.tasks import get_task
 before = resident()
-for task in map(get_task, ("lift", "push_left")):
-    task.record(0, noise=0.2, **task.with_options(stepper=sys.argv[1]).options)
+for name in ("lift", "push_left"):
+    task = get_task(name).with_options(stepper=sys.argv[1])
+    task.record(0, noise=0.2, **task.options)
 print(f"{before:.0f} | {resident():.0f}")
 """
 
@@ -188,6 +276,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=60)
     options = parser.parse_args()
     torch.set_num_threads(1)
+    stock_table(options.rounds)
     step_table(options.rounds)
     policy_table()
     memory_table()

@@ -1,0 +1,146 @@
+"""Compiled code is kept once per user, and compiled anew when what it stands for changes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("robosuite", exc_type=ImportError)
+
+from torchrl_bmrl.envs import caching
+from torchrl_bmrl.envs.control_period import control_period
+
+pytestmark = pytest.mark.robosuite
+
+STEPS = """
+import sys, time
+import numpy as np
+import robosuite.utils.control_utils as control
+{change}
+from torchrl_bmrl.envs.tabletop import STEPPERS, TabletopEnv
+from torchrl_bmrl.envs.control_period import control_period
+joints = []
+for stepper in STEPPERS:
+    env = TabletopEnv("reach", stepper=stepper)
+    env.reset(seed=0)
+    started = time.monotonic()
+    for _ in range(10):
+        observation, *_ = env.step(np.full(7, 0.5))
+    joints.append(observation["robot0_joint_pos"])
+    seconds = locals().get("seconds", time.monotonic() - started)  # of the fast steps
+assert env._fast is None
+assert np.array_equal(*joints), np.abs(joints[0] - joints[1]).max()
+print(sum(control_period.stats.cache_misses.values()), seconds, *joints[0])
+"""
+CHANGES = {
+    "as it is": "",
+    # robosuite's step reads the module's attribute at every call
+    "another function": """
+import numba
+import robosuite.controllers.parts.arm.osc as osc
+@numba.njit(cache=False)
+def error_of(desired, current):
+    return 0.5 * stock(desired, current)
+stock = control.orientation_error
+control.orientation_error = osc.orientation_error = error_of
+""",
+    "another function below it": """
+import numba
+import robosuite.controllers.parts.arm.osc as osc
+@numba.njit(cache=False)
+def factor():
+    return 0.25
+@numba.njit(cache=False)
+def error_of(desired, current):
+    return factor() * stock(desired, current)
+stock = control.orientation_error
+control.orientation_error = osc.orientation_error = error_of
+""",
+}
+CHANGES["another constant below it"] = CHANGES["another function below it"].replace("0.25", "0.75")
+
+
+def played(folder: Path, change: str) -> tuple[int, float, list[float]]:
+    """How often the step was compiled, the seconds of ten steps, where the arm is then."""
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    environment["XDG_CACHE_HOME"] = str(folder)
+    done = subprocess.run(
+        [sys.executable, "-c", STEPS.format(change=change)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stderr
+    misses, seconds, *joints = done.stdout.split()
+    return int(misses), float(seconds), [float(joint) for joint in joints]
+
+
+@pytest.mark.slow
+def test_only_the_first_run_of_a_user_compiles(tmp_path: Path) -> None:
+    (first, compiling, _), (second, loading, _) = (played(tmp_path, "") for _ in range(2))
+    assert (first, second) == (1, 0)
+    assert loading < compiling / 3
+    assert list((tmp_path / "torchrl_bmrl" / "numba").rglob("*control_period*"))
+
+
+@pytest.mark.slow
+def test_a_changed_function_of_robosuite_is_compiled_anew_and_followed(tmp_path: Path) -> None:
+    """In one cache, and each time to the bit what robosuite itself does with that function."""
+    reached = {}
+    for name, change in CHANGES.items():
+        misses, _, reached[name] = played(tmp_path, change)
+        assert misses == 1, name
+    assert len({tuple(joints) for joints in reached.values()}) == len(CHANGES)
+    for name, change in CHANGES.items():
+        misses, _, joints = played(tmp_path, change)
+        assert (misses, joints) == (0, reached[name]), name
+
+
+def test_another_version_of_a_package_is_another_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = caching.fingerprint(control_period)
+    monkeypatch.setattr(caching, "_versions", caching._versions.__wrapped__)
+    assert caching.fingerprint(control_period) == before
+    for package in ("robosuite", "mujoco", "numba", "numpy"):
+        with monkeypatch.context() as patch:
+            patch.setattr(
+                caching, "version", lambda name, package=package: "0" if name == package else "1"
+            )
+            before, now = caching.fingerprint(control_period), before
+            assert before != now
+
+
+OFFSET = 1.0
+TABLE = np.zeros(3)
+
+
+def law(x: float, gain: float = 2.0) -> float:
+    return gain * helper(x) + OFFSET + TABLE[0]
+
+
+def helper(x: float) -> float:
+    return x + 1
+
+
+def test_a_fingerprint_sees_code_defaults_constants_and_what_is_called() -> None:
+    seen = {caching.fingerprint(law)}
+    assert {caching.fingerprint(law)} == seen
+    here = globals()
+    for name, value in {
+        "OFFSET": 1.5,
+        "TABLE": np.ones(3),
+        "helper": lambda x: x + 2,
+        "law.__defaults__": (3.0,),
+    }.items():
+        with pytest.MonkeyPatch.context() as patch:
+            if "." in name:
+                patch.setattr(law, "__defaults__", value)
+            else:
+                patch.setitem(here, name, value)
+            seen.add(caching.fingerprint(law))
+    assert len(seen) == 5
