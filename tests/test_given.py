@@ -159,6 +159,26 @@ def test_a_folder_that_was_not_given_is_compared_and_not_taken_over(
 
 
 @pytest.mark.parametrize(
+    ("overrides", "folder"),
+    [
+        ([], "runs/train_bcq-quick-seed0"),
+        (["preset=smoke", "seed=3"], "runs/train_bcq-smoke-seed3"),
+        (["ablation=dim4"], "runs/train_bcq-quick-dim4-seed0"),
+    ],
+)
+def test_runs_of_other_seeds_and_presets_have_folders_of_their_own(
+    recipes: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    overrides: list[str],
+    folder: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, (config,) = started(recipes, "train_bcq", *overrides)
+    assert (code, config.run_dir) == (0, folder)
+
+
+@pytest.mark.parametrize(
     ("key", "value"),
     [
         ("bcq.lr", "fast"),
