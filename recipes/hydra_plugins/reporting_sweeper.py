@@ -89,7 +89,8 @@ class ReportingSweeper(BasicSweeper):
 
     def compose_all(self, arguments: list[str]) -> list[list[str]]:
         """Each job's overrides; exits, before anything is written, if some are not valid."""
-        assert self.hydra_context is not None and self.config is not None
+        assert self.hydra_context is not None
+        assert self.config is not None
         loader = self.hydra_context.config_loader
         lines = [*self._parse_config(), *arguments]
         overrides = OverridesParser.create(config_loader=loader).parse_overrides(lines)

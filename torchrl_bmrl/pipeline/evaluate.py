@@ -204,7 +204,7 @@ def embed(run: Run, split: str) -> tuple[Embeddings, float]:
         phase, names = read_phases(path, split=split)
         phases.append(phase.numpy())
         phase_names |= {task.name: names} if names else {}
-    data: TensorDictBase = torch.cat(parts)  # type: ignore[assignment]
+    data: TensorDictBase = torch.cat(parts)
     embeddings = Embeddings(
         task_latent=student.embed(data).numpy(),
         task=data["task"].numpy(),
