@@ -93,7 +93,6 @@ def test_a_command_on_a_run_takes_what_it_does_not_give_from_the_folder(
         (["evaluate.episodes=20"], "evaluate.episodes is 20 here and 50 in"),
         (["~collect.after"], "does not support deletion"),
         (["device=gpu"], "device is gpu here and cuda in"),
-        (["evaluate.fqe_updates=-5"], "evaluate.fqe_updates is -5; valid: above 0"),
     ],
 )
 def test_what_a_command_gives_and_differs_is_refused(

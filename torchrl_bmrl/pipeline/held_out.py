@@ -47,7 +47,7 @@ def evaluate_held_out(run: Run) -> Table:
         the numbers of every task.
     """
     log.warning("some tasks have no environment: held-out losses and estimates instead of returns")
-    updates = run.settings.evaluate.fqe_updates
+    updates = _critic_updates(run)
     rows = run.jobs(
         held_out_job,
         run.names,
@@ -86,7 +86,7 @@ def held_out_job(job: tuple[Run, str], report: Report) -> dict[str, str | float]
     run, name = job
     path = run.folder / "evaluation" / f"{name}-held_out.csv"
     if path.exists():
-        report(2 * run.settings.evaluate.fqe_updates)
+        report(2 * _critic_updates(run))
         return read_rows(path, COLUMNS)[0]
     valid, index = run.transitions(name, "valid"), run.names.index(name)
     loss, (student, metadata) = run.teacher(name), run.student()
@@ -109,7 +109,7 @@ def held_out_job(job: tuple[Run, str], report: Report) -> dict[str, str | float]
     ]
     train, settings = run.transitions(name, "train"), run.settings
     options: dict[str, Any] = {
-        "updates": settings.evaluate.fqe_updates,
+        "updates": _critic_updates(run),
         "gamma": settings.bcq.gamma,
         "num_cells": settings.bcq.num_cells,
         "device": settings.device,
@@ -130,6 +130,12 @@ def held_out_job(job: tuple[Run, str], report: Report) -> dict[str, str | float]
     }
     write_rows(path, [row])
     return row
+
+
+def _critic_updates(run: Run) -> int:
+    """Updates of fitted Q evaluation: 3,000, or as many as stage 1 has if these are fewer."""
+    bcq = run.settings.bcq
+    return min(3000, bcq.epochs * bcq.updates_per_epoch)
 
 
 def _discounted_return(data: TensorDictBase, gamma: float) -> float:

@@ -329,4 +329,6 @@ def _train_episodes(settings: Settings, tasks: Sequence[Task]) -> dict[str, int]
                 f"collect.train_episodes has {', '.join(given) or 'nothing'}; valid: a number "
                 f"for {name}, or for default"
             )
-    return {name: given.get(name, given.get("default", 0)) for name in recorded}
+    # Numbers for tasks that the run leaves out stay, as in the folders of earlier versions.
+    named = {name: number for name, number in given.items() if name != "default"}
+    return {name: given.get(name, given.get("default", 0)) for name in recorded} | named

@@ -99,7 +99,6 @@ class EvaluateSettings:
     latent_sources: list[str] = setting(["prototype"], choices=LATENT_SOURCES, unique=True)
     policy: str | None = None  # an exported policy's file, evaluated alone
     expert_rollouts: bool = False  # false: the expert's rows are its demonstrations
-    fqe_updates: int = setting(3000, above=0)  # of fitted Q evaluation, without an environment
 
 
 @dataclass
