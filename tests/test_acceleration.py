@@ -168,7 +168,7 @@ HONOURED = {
     "every substep": {"control_freq": 500},
     "physics of robosuite 1.4": {"lite_physics": False},
     "no gripper": {"gripper_types": None},
-    "three fingers": {"gripper_types": "Robotiq85Gripper"},
+    "another gripper": {"gripper_types": "Robotiq85Gripper"},
     "no noise": {"initialization_noise": None},
     "world frame": controller(input_ref_frame="world"),
     "variable impedance": controller(impedance_mode="variable"),

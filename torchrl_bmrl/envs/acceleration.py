@@ -76,7 +76,7 @@ class _FastStep:
         self.env = env
         self.stepper: FastStepper | None = None
         self.memory: _Memory
-        self.said: set[str] = set()
+        self.warned: set[str] = set()
 
     def __call__(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, dict[str, Any]]:
         env = self.env
@@ -84,8 +84,8 @@ class _FastStep:
         if stepper is None or not stepper.serves(env):
             self.stepper = None  # frees the last episode's model
             if (obstacle := why_not_fast(env)) is not None:
-                if obstacle.reason not in self.said:
-                    self.said.add(obstacle.reason)
+                if obstacle.reason not in self.warned:
+                    self.warned.add(obstacle.reason)
                     message = f"steps are robosuite's own, and slow: {obstacle}"
                     warnings.warn(message, RuntimeWarning, stacklevel=2)
                 return type(env).step(env, action)

@@ -1,4 +1,4 @@
-"""Where compiled code is kept, and for what it stands."""
+"""Cache of compiled code: its directory, and when it is invalid."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ with needs("robosuite"):
     from numba.core import config
 
 PACKAGES = ("robosuite", "mujoco", "numba", "numpy")
-"""Another version of one of them compiles anew."""
+"""A new version of one of these packages invalidates the cache."""
 
 
 def numba_cache_dir() -> Path:
     """The user's directory of compiled code: ``$XDG_CACHE_HOME/torchrl_bmrl/numba``.
 
-    ``NUMBA_CACHE_DIR``, numba's own setting, has precedence.
+    numba's own setting ``NUMBA_CACHE_DIR`` takes precedence.
     """
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(config.CACHE_DIR or Path(home) / "torchrl_bmrl" / "numba")
@@ -35,14 +35,14 @@ def numba_cache_dir() -> Path:
 
 @contextmanager
 def user_numba_cache(*functions: Any) -> Iterator[None]:
-    """Functions decorated inside are compiled once per user, wherever their package is installed.
+    """Caches functions decorated inside once per user, wherever their package is installed.
 
-    By default numba writes beside the source, which fails in a read-only installation and is lost
-    with a container's. Other packages' functions are left where they are.
+    By default numba writes its cache beside the source. That fails in a read-only installation, and
+    the cache is lost with a container. The caches of other packages are not moved.
 
     Args:
-        *functions: that are compiled in: another :func:`fingerprint` is another directory. numba
-            itself compares the file of a function with what was compiled, not what it calls.
+        *functions: compiled functions; their :func:`fingerprint` names the subdirectory. numba
+            alone notices a change of a function's file, but not of the functions that it calls.
     """
     before = config.CACHE_DIR
     config.CACHE_DIR = str(numba_cache_dir() / fingerprint(*functions))
@@ -53,23 +53,22 @@ def user_numba_cache(*functions: Any) -> Iterator[None]:
 
 
 def cached_njit(function: Callable[..., Any]) -> Any:
-    """``numba.njit`` whose result is kept for as long as all that it compiles is the same."""
+    """``numba.njit`` with a cache that is valid until something that it compiles changes."""
     with user_numba_cache(function):
         return numba.njit(cache=True)(function)
 
 
 def fingerprint(*functions: Any) -> str:
-    """What numba compiles of functions, as 16 hexadecimal digits.
+    """Hash of everything that numba compiles for some functions, as 16 hexadecimal digits.
 
-    It depends on the versions of :data:`PACKAGES`, on each function's code, defaults and closure,
-    and on everything that these name outside of themselves: other functions, as deep as they call
-    each other, and constants, which numba compiles in.
+    It covers the versions of :data:`PACKAGES`; each function's code, defaults and closure; the
+    functions that they call, recursively; and global constants, which numba compiles in.
     """
     digest = hashlib.sha256(_versions().encode())
     todo, seen = list(functions), set()
     while todo:
         value = todo.pop()
-        value = getattr(value, "py_func", value)  # of what numba has decorated
+        value = getattr(value, "py_func", value)  # the function that numba decorated
         if isinstance(value, FunctionType):
             if value in seen:
                 continue
@@ -85,7 +84,7 @@ def fingerprint(*functions: Any) -> str:
                 digest.update(name.encode())
                 named = value.__globals__.get(name)
                 todo.append(named)
-                if isinstance(named, ModuleType):  # its own functions are known by its version
+                if isinstance(named, ModuleType):  # its version covers its own functions
                     parts = [getattr(named, part, None) for part in names]
                     todo += [x for x in parts if _is_compiled_in(x)]
         elif isinstance(value, np.ndarray):
@@ -113,6 +112,6 @@ def _versions() -> str:
 
 
 def _codes(code: CodeType) -> list[CodeType]:
-    """A function's code and that of the comprehensions and functions inside."""
+    """Code objects of a function and of the comprehensions and functions inside it."""
     inner = [each for each in code.co_consts if isinstance(each, CodeType)]
     return [code, *(nested for each in inner for nested in _codes(each))]

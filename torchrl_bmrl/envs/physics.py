@@ -1,4 +1,4 @@
-"""The MuJoCo that robosuite works with, and its library."""
+"""Which MuJoCo robosuite works with, and where its shared library is."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from pathlib import Path
 from torchrl_bmrl.errors import MissingExtraError
 
 BELOW = (3, 10)
-"""robosuite 1.5 fails from this version of MuJoCo on."""
+"""robosuite 1.5 fails with this and later versions of MuJoCo."""
 
 
 def check_mujoco(version: str | None) -> None:
-    """Refuses a MuJoCo that robosuite fails with, in a call or in silence.
+    """Refuses a version of MuJoCo with which robosuite fails or silently misbehaves.
 
     Args:
-        version: ``mujoco.__version__``; ``None`` where it has none, which is what pip leaves of it
-            when one of two distributions that share files is uninstalled.
+        version: ``mujoco.__version__``, or ``None`` if it is missing. It is missing after pip has
+            uninstalled one of two distributions that share files.
 
     Raises:
-        MissingExtraError: saying why, and what to install.
+        MissingExtraError: with the reason and what to install.
 
     Example:
         >>> check_mujoco("3.9.0")
@@ -42,9 +42,9 @@ def check_mujoco(version: str | None) -> None:
 
 @contextmanager
 def kept_environment(variable: str) -> Iterator[None]:
-    """Leaves a variable of the environment as it was.
+    """Restores an environment variable on exit.
 
-    robosuite's import sets ``MUJOCO_GL`` to EGL, whatever the machine has and the user chose.
+    Importing robosuite sets ``MUJOCO_GL`` to EGL, whatever the user chose.
 
     Example:
         >>> with kept_environment("NO_SUCH_VARIABLE"):
@@ -63,15 +63,15 @@ def kept_environment(variable: str) -> Iterator[None]:
 
 
 def mujoco_library(folder: Path, version: str, platform: str) -> Path | str:
-    """The library that mujoco's bindings of a version have loaded, or why there is none.
+    """Path of the shared library of a MuJoCo version, or the reason why there is none.
 
-    Libraries of other versions may lie beside it: mujoco 4's belong to distributions that pip
-    leaves behind. Loading a second one ends the process.
+    The folder may contain libraries of other versions: pip leaves those of mujoco 4 behind. Loading
+    a second version crashes the process.
 
     Args:
-        folder: of mujoco's Python package.
-        version: of mujoco, such as ``"3.8.1"``.
-        platform: as ``sys.platform`` has it.
+        folder: directory of the Python package ``mujoco``.
+        version: such as ``"3.8.1"``.
+        platform: value of ``sys.platform``.
 
     Example:
         >>> import tempfile
