@@ -316,6 +316,9 @@ class Run:
         """Steps after which an episode is cut off.
 
         The task's horizon; without one gymnasium's, or the length of the longest demonstration.
+
+        Args:
+            task: of the run, or one of its compositions.
         """
         horizon = task.horizon
         if horizon is None and "env" in task.options:
