@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import doctest
 import functools
 import importlib
@@ -144,6 +145,18 @@ def entries(text: str) -> set[str]:
     return {name for line in lines for name in line.split(", ")}
 
 
+def commented(cls: type) -> set[str]:
+    """Fields of a dataclass of settings that a comment describes, on their line or before it."""
+    if not (dataclasses.is_dataclass(cls) and cls.__name__.endswith("Settings")):
+        return set()
+    lines = inspect.getsource(cls).splitlines()
+    return {
+        line.partition(":")[0].strip()
+        for before, line in pairwise(lines)
+        if "  # " in line or before.strip().startswith("# ")
+    }
+
+
 def raised(function: FunctionType) -> set[str]:
     """The library's errors that a function raises itself."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
@@ -196,13 +209,16 @@ def test_every_parameter_is_described(name: str) -> None:
     missing = []
     for key, function, text in described(name):
         method = "." in key and not key.endswith("__init__")
+        known = entries(text)
+        if key.endswith(".__init__"):
+            known |= commented(members(name)[key.partition(".")[0]])
         for parameter in inspect.signature(function).parameters.values():
             usual = parameter.name in ("self", "cls") or parameter.kind in (
                 inspect.Parameter.VAR_POSITIONAL,
                 inspect.Parameter.VAR_KEYWORD,
             )
             usual = usual or (method and TORCHRL.fullmatch(parameter.name) is not None)
-            if not usual and parameter.name not in entries(text):
+            if not usual and parameter.name not in known:
                 missing.append(f"{key}({parameter.name})")
     assert missing == []
 

@@ -26,6 +26,19 @@ def collect(run: Run) -> None:
 
     Raises:
         BMRLError: for demonstrations that cannot be recorded or trained on.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl_bmrl.pipeline import CollectSettings, Settings
+        >>> settings = Settings(
+        ...     run_dir=tempfile.mkdtemp(),
+        ...     tasks={"reach": {"task": "reach", "horizon": 2}},
+        ...     collect=CollectSettings(train_episodes={"reach": 1}, valid_episodes=1),
+        ... )
+        >>> with Run(settings) as run:
+        ...     collect(run)
+        ...     run.transitions("reach", "train").shape
+        torch.Size([2])
     """
     run.check_open()
     settings = run.settings.collect

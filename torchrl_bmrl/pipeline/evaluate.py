@@ -45,6 +45,13 @@ def evaluate(run: Run) -> str:
 
     Raises:
         BMRLError: if something is missing or damaged.
+
+    Example:
+        >>> from torchrl_bmrl.pipeline import Settings
+        >>> evaluate(Run(Settings(tasks=["reach"])))
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.BMRLError: runs/mine is not open; valid: with Run(settings) as run: ...
     """
     run.check_open()
     settings, alone = run.settings.evaluate, run.settings.evaluate.policy is not None

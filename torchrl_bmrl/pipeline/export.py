@@ -72,6 +72,13 @@ def export(run: Run) -> None:
 
     Raises:
         BMRLError: if something is missing or damaged.
+
+    Example:
+        >>> from torchrl_bmrl.pipeline import Settings
+        >>> export(Run(Settings(tasks=["reach"])))
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.BMRLError: runs/mine is not open; valid: with Run(settings) as run: ...
     """
     run.check_open()
     student, metadata = run.student()

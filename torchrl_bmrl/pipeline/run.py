@@ -133,6 +133,9 @@ class Run:
     def task(self, name: str) -> Task:
         """The task of a name.
 
+        Args:
+            name: of a task of the run.
+
         Raises:
             UnknownNameError: for a name that is not a task of the run.
         """
@@ -141,7 +144,10 @@ class Run:
         return self.tasks[self.names.index(name)]
 
     def composition(self, name: str) -> Task:
-        """The task of several of this run's tasks in a row, such as ``"reach-lift"``.
+        """The task of several of this run's tasks in a row.
+
+        Args:
+            name: of the tasks, such as ``"reach-lift"``.
 
         Raises:
             ConfigError: for a name that is not a task of the run, or tasks that cannot be composed.
@@ -163,11 +169,19 @@ class Run:
         return self.folder / "distill" / "checkpoint.safetensors"
 
     def demonstrations(self, name: str) -> Path:
-        """The file with a task's demonstrations."""
+        """The file with a task's demonstrations.
+
+        Args:
+            name: of the task.
+        """
         return demonstration_path(self.data_dir, name)
 
     def agent_path(self, name: str) -> Path:
-        """Checkpoint of a stage-1 agent; the first agent of a task has the task's name."""
+        """Checkpoint of a stage-1 agent; the first agent of a task has the task's name.
+
+        Args:
+            name: of the agent.
+        """
         return self.folder / "bcq" / name / "checkpoint.safetensors"
 
     @cached_property
@@ -188,7 +202,11 @@ class Run:
         )
 
     def teacher(self, name: str) -> BCQLoss:
-        """The trained agent of a task, frozen."""
+        """The trained agent of a task, frozen.
+
+        Args:
+            name: of the task.
+        """
         return load_bcq_loss(self.agent_path(name))[0]
 
     def student(self) -> tuple[Student, dict[str, Any]]:
@@ -262,7 +280,13 @@ class Run:
         )
 
     def make_env(self, name: str, *transforms: Transform, num_envs: int) -> TransformedEnv:
-        """A task's environment with this run's normalisation, see :func:`~envs.make_env`."""
+        """A task's environment with this run's normalisation.
+
+        Args:
+            name: of the task.
+            *transforms: appended, as in :func:`~torchrl_bmrl.envs.transforms.make_env`.
+            num_envs: number of episodes side by side.
+        """
         return make_env(self.task(name), self.statistics, *transforms, num_envs=num_envs)
 
     def play(
@@ -292,6 +316,9 @@ class Run:
         """Steps after which an episode is cut off.
 
         The task's horizon; without one gymnasium's, or the length of the longest demonstration.
+
+        Args:
+            task: of the run, or one of its compositions.
         """
         horizon = task.horizon
         if horizon is None and "env" in task.options:

@@ -36,6 +36,13 @@ def stage1(run: Run) -> None:
 
     Raises:
         BMRLError: naming the agents that diverged, after the others are trained.
+
+    Example:
+        >>> from torchrl_bmrl.pipeline import Settings
+        >>> stage1(Run(Settings(tasks=["reach"])))
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.BMRLError: runs/mine is not open; valid: with Run(settings) as run: ...
     """
     bcq = run.settings.bcq
     agents = {

@@ -42,6 +42,13 @@ def stage2(run: Run) -> None:
 
     Raises:
         BMRLError: if an agent is missing, or the training diverges.
+
+    Example:
+        >>> from torchrl_bmrl.pipeline import Settings
+        >>> stage2(Run(Settings(tasks=["reach"])))
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.BMRLError: runs/mine is not open; valid: with Run(settings) as run: ...
     """
     run.jobs(
         train_student,

@@ -32,6 +32,13 @@ def two_stage(run: Run) -> str:
 
     Raises:
         BMRLError: of a stage.
+
+    Example:
+        >>> from torchrl_bmrl.pipeline import Settings
+        >>> two_stage(Run(Settings(tasks=["reach"])))
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.BMRLError: runs/mine is not open; valid: with Run(settings) as run: ...
     """
     run.check_open()
     path = run.folder / "seconds.json"

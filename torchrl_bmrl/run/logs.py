@@ -48,6 +48,11 @@ def log_to_stderr(*, verbose: bool = False) -> None:
     Args:
         verbose: also show messages of the level ``DEBUG``; otherwise ``INFO`` and above.
 
+    Example:
+        >>> log_to_stderr(verbose=True)
+        >>> LOGGER.level == logging.DEBUG
+        True
+        >>> LOGGER.handlers.clear()
     """
     LOGGER.setLevel(logging.DEBUG if verbose else logging.INFO)
     if not any(isinstance(handler, StderrHandler) for handler in LOGGER.handlers):

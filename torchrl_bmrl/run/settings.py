@@ -63,6 +63,12 @@ def check_settings(settings: Any, prefix: str = "") -> None:
     Raises:
         UnknownNameError: for a value that is none of the choices.
         ConfigError: naming the field, its value and what is valid.
+
+    Example:
+        >>> @dataclasses.dataclass
+        ... class Small:
+        ...     kind: str = setting("a", choices=("a", "b"))
+        >>> check_settings(Small())
     """
     for field in dataclasses.fields(settings):
         name, value = f"{prefix}{field.name}", getattr(settings, field.name)

@@ -49,6 +49,10 @@ def stop_on_signals() -> Iterator[None]:
     """Has Ctrl-C, SIGTERM and SIGHUP stop the work at its next :func:`check_stop`.
 
     Only in a process's main thread, which alone may handle signals; elsewhere nothing changes.
+
+    Example:
+        >>> with stop_on_signals():
+        ...     check_stop()
     """
     global _asked
     if threading.current_thread() is not threading.main_thread():
