@@ -258,9 +258,9 @@ class Run:
             unit=unit,
         )
 
-    def make_env(self, name: str, *transforms: Transform, num_envs: int) -> TransformedEnv:
+    def make_env(self, task: Task, *transforms: Transform, num_envs: int) -> TransformedEnv:
         """A task's environment with this run's normalisation, see :func:`~envs.make_env`."""
-        return make_env(self.task(name), self.statistics, *transforms, num_envs=num_envs)
+        return make_env(task, self.statistics, *transforms, num_envs=num_envs)
 
     def play(
         self,
