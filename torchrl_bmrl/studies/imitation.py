@@ -15,7 +15,6 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
-from torch import Tensor
 from torch.nn.functional import mse_loss
 from torchrl.envs.transforms import StepCounter, Transform
 from torchrl.modules import MLP
@@ -35,8 +34,6 @@ from torchrl_bmrl.run.progress import progress
 from torchrl_bmrl.run.settings import setting
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.tasks import Task
-from torchrl_bmrl.training.fit import Every, fit
-from torchrl_bmrl.training.health import check_metrics
 
 METHODS = (*(f"demonstration, by {name}" for name in ALIGNMENTS), "task index", "cloning", "replay")
 PERTURBATIONS = ("none", "magnitude", "direction", "both", "both, constant")
@@ -134,19 +131,7 @@ def _check(settings: ImitateSettings, task: Task, known: list[str]) -> None:
 
 
 def demonstrate(run: Run, task: Task, number: int) -> TensorDictBase:
-    """A demonstration that succeeds, recorded once.
-
-    Args:
-        run: the run.
-        task: a composition.
-        number: of the demonstration.
-
-    Returns:
-        normalised transitions ``[T]``, with the ``stage (T,)`` before each action.
-
-    Raises:
-        BMRLError: if the expert fails from all starts that are tried.
-    """
+    """A demonstration that succeeds, recorded once: normalised, with ``stage`` before actions."""
 
     def record(path: Path) -> None:
         assert task.record is not None
@@ -191,14 +176,7 @@ def play_job(job: tuple[Run, Job], report: Report) -> list[dict[str, Any]]:
 def make_method(
     run: Run, settings: ImitateSettings, method: str, number: int
 ) -> tuple[TensorDictModuleBase, list[Transform]]:
-    """The policy of a method and the transforms that it needs.
-
-    Args:
-        run: the run.
-        settings: of the study.
-        method: one of :data:`METHODS`.
-        number: of the demonstration.
-    """
+    """The policy of a method, given a demonstration's number, and the transforms that it needs."""
     task = run.compose(settings.composition)
     demonstration = demonstrate(run, task, number)
     if method == "replay":
@@ -224,50 +202,24 @@ def make_method(
 def clone_behaviour(
     demonstration: TensorDictBase, *, updates: int, seed: int
 ) -> TensorDictModuleBase:
-    """A deterministic policy from regression of a demonstration's actions on its observations.
-
-    Args:
-        demonstration: transitions ``[T]``.
-        updates: number of updates, each on the whole demonstration.
-        seed: of the initial weights.
-
-    Raises:
-        BMRLError: if the loss is not finite at the end.
-    """
+    """A policy from regression of a demonstration's actions on its observations."""
     observation, action = demonstration["observation"], demonstration["action"]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = MLP(observation.shape[-1], action.shape[-1], num_cells=[256, 256],
                       activation_class=torch.nn.ReLU)  # fmt: skip
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
-
-    def step(update: int, batch: TensorDictBase) -> dict[str, Tensor]:
+    for _ in range(updates):
         optimizer.zero_grad()
-        loss = mse_loss(network(observation), action)
-        loss.backward()
+        mse_loss(network(observation), action).backward()
         optimizer.step()
-        return {"loss": loss.detach()}
-
-    fit(
-        step,
-        lambda: demonstration,
-        total=updates,
-        every=Every(log=updates, save=updates),
-        check=lambda update, metrics, *_: check_metrics(metrics, f"cloning, update {update}"),
-        save=lambda update: None,
-    )
     return TensorDictModule(
         lambda observation: network(observation).clamp(-1, 1), ["observation"], ["action"]
     )
 
 
 def make_perturbation(settings: ImitateSettings, name: str) -> list[Transform]:
-    """The transform that perturbs the executed actions; empty for ``"none"``.
-
-    Args:
-        settings: of the study.
-        name: one of :data:`PERTURBATIONS`.
-    """
+    """The transform that perturbs the executed actions, if any."""
     magnitude, angle = {"magnitude": settings.magnitude}, {"max_angle": settings.max_angle}
     options: dict[str, Any] = {
         "none": {},
@@ -280,13 +232,7 @@ def make_perturbation(settings: ImitateSettings, name: str) -> list[Transform]:
 
 
 def make_table(settings: ImitateSettings, titles: list[str], rows: list[dict[str, Any]]) -> Table:
-    """Success of each stage and of the whole composition, by method and perturbation.
-
-    Args:
-        settings: of the study.
-        titles: of the composition's tasks.
-        rows: of all episodes.
-    """
+    """Success of each task and of the whole composition, by method and perturbation."""
     lines = []
     for method in METHODS:
         for perturbation in PERTURBATIONS:

@@ -201,8 +201,7 @@ class Embedding:
         m = self.student.embed(transform_data(raw, task, self.run.statistics)).double().numpy()
         masks = [raw["episode"].numpy() == i for i in np.unique(raw["episode"])]
         longest = max(mask.sum() for mask in masks)
-        padding = [((0, longest - mask.sum()), (0, 0)) for mask in masks]
-        episodes = [np.pad(m[mask], each, "edge") for mask, each in zip(masks, padding)]
+        episodes = [np.pad(m[mask], ((0, longest - mask.sum()), (0, 0)), "edge") for mask in masks]
         successes = [_success(raw).numpy()[mask] for mask in masks]
         return episodes, [int(x.argmax() if x.any() else len(x)) for x in successes]
 

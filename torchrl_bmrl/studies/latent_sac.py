@@ -125,15 +125,7 @@ def latent_sac(run: Run, settings: LatentSACSettings) -> str:
 
 
 def train_job(job: tuple[Run, tuple[LatentSACSettings, str, int]], report: Report) -> list[Row]:
-    """Trains one agent and evaluates it as it learns; a finished agent is read back.
-
-    Args:
-        job: the run, and settings, variant and seed of the agent.
-        report: called with the number of steps done since its last call.
-
-    Returns:
-        one row per evaluation.
-    """
+    """Trains the agent of a variant and a seed, or reads it back; one row per evaluation."""
     run, (settings, variant, seed) = job
     path = run.folder / "latent_sac" / settings.name / f"{variant}-seed{seed}.csv"
     if path.exists():
@@ -203,12 +195,7 @@ def make_agent_env(
 ) -> EnvBase:
     """The composition as the agent sees it: sparse reward and actions in [-1, 1].
 
-    Args:
-        run: the run.
-        settings: of the study.
-        variant: one of :data:`VARIANTS`.
-        num_envs: batch size.
-        stop: whether success ends an episode, as a termination: no reward can follow.
+    With ``stop``, success ends an episode. It is a termination: no reward can follow.
     """
     task = run.compose(settings.composition)
     env = run.make_env(task, StageReward(len(task.stages)), num_envs=num_envs)
@@ -226,12 +213,7 @@ def make_agent_env(
 
 
 def make_sac(env: EnvBase, gamma: float) -> SACLoss:
-    """TorchRL's SAC for an environment with ``observation``, ``progress`` and ``action``.
-
-    Args:
-        env: the environment.
-        gamma: discount per action of the agent.
-    """
+    """TorchRL's SAC; ``gamma`` is the discount per action of the agent."""
     state_dim = sum(env.observation_spec[key].shape[-1] for key in STATE)
     action_dim = env.action_spec.shape[-1]
     actor = ProbabilisticActor(
@@ -256,25 +238,12 @@ def make_sac(env: EnvBase, gamma: float) -> SACLoss:
 
 
 def steps_to_half(rows: list[Row]) -> int | None:
-    """Environment steps at an agent's first evaluation with a success rate of at least one half.
-
-    Args:
-        rows: of the agent's evaluations, in their order.
-
-    Example:
-        >>> steps_to_half([{"environment_steps": 100, "success": 0.6}])
-        100
-    """
+    """Environment steps at an agent's first evaluation with at least 50% success."""
     return next((row["environment_steps"] for row in rows if row["success"] >= 0.5), None)
 
 
 def make_table(settings: LatentSACSettings, agents: list[list[Row]]) -> Table:
-    """One line per agent.
-
-    Args:
-        settings: of the study.
-        agents: the rows of each agent.
-    """
+    """One line per agent."""
     lines = []
     for rows in agents:
         half, successes = steps_to_half(rows), [row["success"] for row in rows]
