@@ -78,8 +78,9 @@ def imitate(run: Run, settings: ImitateSettings) -> str:
         BMRLError: for settings that are not valid, or a missing policy.
     """
     run.check_open()
-    task = run.compose(settings.composition)
-    _check(settings, task, run.student()[1]["tasks"])
+    task = run.composition(settings.composition)
+    _check(settings, task)
+    run.student()  # a missing policy is an error before anything is written
     open_run(run.folder / "imitation", asdict(settings))
     with progress(settings.demonstrations, "demonstrating", "demonstration") as bar:
         for number in range(settings.demonstrations):
@@ -101,20 +102,13 @@ def imitate(run: Run, settings: ImitateSettings) -> str:
     )
     rows = [row for part in results for row in part]
     write_rows(run.folder / "imitation" / "results.csv", rows)
-    titles = [run.compose(name).title for name in task.stages]
-    table = make_table(settings, titles, rows)
+    table = make_table(settings, [run.titles[name] for name in task.stages], rows)
     section = Section(heading="One-shot imitation", tables=[table])
     write_study(run.folder, "imitation", section, {})
     return table.markdown()
 
 
-def _check(settings: ImitateSettings, task: Task, known: list[str]) -> None:
-    missing = [name for name in task.stages if name not in known]
-    if missing:
-        raise ConfigError(
-            f"imitate.composition is {task.name}, but the policy was not trained on {missing[0]}; "
-            f"valid: tasks of the policy ({', '.join(known)})"
-        )
+def _check(settings: ImitateSettings, task: Task) -> None:
     if task.record is None or len(task.stages) < 2:
         raise ConfigError(
             f"imitate.composition is {task.name}; valid: several tasks with scripted experts, "
@@ -152,7 +146,10 @@ def demonstrate(run: Run, task: Task, number: int) -> TensorDictBase:
 def play_job(job: tuple[Run, Job], report: Report) -> list[dict[str, Any]]:
     """The episodes that one demonstration drives with one method and perturbation, played once."""
     run, (settings, method, perturbation, number) = job
-    task, count = run.compose(settings.composition), settings.episodes // settings.demonstrations
+    task, count = (
+        run.composition(settings.composition),
+        settings.episodes // settings.demonstrations,
+    )
 
     def play(path: Path) -> None:
         policy, sources = make_method(run, settings, method, number)
@@ -177,7 +174,7 @@ def make_method(
     run: Run, settings: ImitateSettings, method: str, number: int
 ) -> tuple[TensorDictModuleBase, list[Transform]]:
     """The policy of a method, given a demonstration's number, and the transforms that it needs."""
-    task = run.compose(settings.composition)
+    task = run.composition(settings.composition)
     demonstration = demonstrate(run, task, number)
     if method == "replay":
         actions = demonstration["action"]
@@ -220,8 +217,9 @@ def clone_behaviour(
 
 def make_perturbation(settings: ImitateSettings, name: str) -> list[Transform]:
     """The transform that perturbs the executed actions, if any."""
-    magnitude, angle = {"magnitude": settings.magnitude}, {"max_angle": settings.max_angle}
-    options: dict[str, Any] = {
+    magnitude: dict[str, Any] = {"magnitude": settings.magnitude}
+    angle: dict[str, Any] = {"max_angle": settings.max_angle}
+    options = {
         "none": {},
         "magnitude": magnitude,
         "direction": angle,

@@ -94,7 +94,7 @@ def latent_sac(run: Run, settings: LatentSACSettings) -> str:
         raise ConfigError(
             f"latent_sac.random_steps is {settings.random_steps}; valid: 0 to environment_steps"
         )
-    run.compose(settings.composition)
+    run.composition(settings.composition)
     run.student()  # a missing policy is an error before anything is written
     folder = run.folder / "latent_sac" / settings.name
     # Seeds may be added later; all other settings must agree.
@@ -140,7 +140,7 @@ def train_job(job: tuple[Run, tuple[LatentSACSettings, str, int]], report: Repor
     # Evaluated over whole episodes, which success does not end.
     eval_env = make_agent_env(run, settings, variant, settings.eval_episodes, stop=False)
     starts = [derive_seed(seed, "latent_sac", "evaluate", i) for i in range(settings.eval_episodes)]
-    max_steps = -(-run.horizon(run.compose(settings.composition)) // hold)
+    max_steps = -(-run.horizon(run.composition(settings.composition)) // hold)
     loss = make_sac(env, GAMMA**hold)
 
     def evaluate(steps: int) -> Row:
@@ -197,7 +197,7 @@ def make_agent_env(
 
     With ``stop``, success ends an episode. It is a termination: no reward can follow.
     """
-    task = run.compose(settings.composition)
+    task = run.composition(settings.composition)
     env = run.make_env(task, StageReward(len(task.stages)), num_envs=num_envs)
     if stop:
         env.append_transform(TerminateTransform(lambda after: after["success"]))
