@@ -20,12 +20,14 @@ trap 'rm -rf "$folder"' EXIT
 import numpy as np
 import robosuite
 
-for arm in ("Panda", "IIWA", "XArm7"):
+EXPECTED = {"Panda": ("x", "x"), "IIWA": ("x", "y"), "XArm7": ("x", "y")}
+
+for arm, axes in EXPECTED.items():
     env = robosuite.make(
         "Lift", robots=arm, use_camera_obs=False, has_offscreen_renderer=False,
         initialization_noise=None,
     )
-    for turn in (0, np.pi / 2):
+    for turn, axis in zip((0, np.pi / 2), axes):
         env.reset()
         robot = env.robots[0]
         joints = np.array(robot.init_qpos)
@@ -38,4 +40,6 @@ for arm in ("Panda", "IIWA", "XArm7"):
             env.step(np.eye(env.action_dim)[0])  # +x
         moved = np.round(env.sim.data.site_xpos[hand] - before, 3)
         print(f"{arm}, first joint turned by {np.degrees(turn):.0f} degrees: moved {moved} m")
+        found = "xyz"[np.abs(moved).argmax()]
+        assert found == axis, f"moved along {found}, where {axis} was seen"
 PY

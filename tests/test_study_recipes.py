@@ -1,9 +1,10 @@
-"""Recipes that study a finished run: imitation, interpolation, learning on top."""
+"""Studies of a finished run: imitation, interpolation, learning on top."""
 
 from __future__ import annotations
 
 import csv
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,144 +14,201 @@ import torch
 pytest.importorskip("hydra")
 pytest.importorskip("gymnasium")
 pytest.importorskip("h5py")
+pytest.importorskip("matplotlib")
 pytest.importorskip("safetensors")
 pytest.importorskip("scipy")
+pytest.importorskip("sklearn")
 pytest.importorskip("tqdm")
 
-from omegaconf import OmegaConf
-from small_runs import (
-    HORIZON,
-    SMALL,
+from small_runs import HORIZON, SMALL, TASKS, configured, contents, times
+
+from torchrl_bmrl.errors import BMRLError, ConfigError
+from torchrl_bmrl.pipeline import (
+    BCQSettings,
+    CollectSettings,
+    DistillSettings,
+    EvaluateSettings,
     Run,
-    configured,
-    contents,
-    times,
+    Settings,
+    collect,
+    stage1,
+    stage2,
 )
+from torchrl_bmrl.run.settings import check_settings
+from torchrl_bmrl.studies import imitation, interpolation, interpolation_report
+from torchrl_bmrl.studies.imitation import ImitateSettings, imitate
+from torchrl_bmrl.studies.interpolation import InterpolationSettings, interpolate
+from torchrl_bmrl.studies.latent_sac import (
+    LatentSACSettings,
+    latent_sac,
+    make_table,
+    steps_to_half,
+    train_job,
+)
+
+
+def make_run(folder: Path) -> Run:
+    return Run(
+        Settings(
+            run_dir=str(folder),
+            workers=1,
+            tasks=TASKS,
+            collect=CollectSettings(train_episodes={"default": 1}, valid_episodes=2),
+            bcq=BCQSettings(epochs=1, updates_per_epoch=6, batch_size=8, num_cells=[16, 16]),
+            distill=DistillSettings(
+                updates=12, batch_size=8, num_cells=[16, 16], task_latent_dim=3
+            ),
+            evaluate=EvaluateSettings(num_candidates=5),
+        )
+    )
+
+
+def study(folder: Path, function: Any, settings: Any) -> str:
+    with make_run(folder) as run:
+        return function(run, settings)
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def distilled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder with demonstrations and both stages."""
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    folder = tmp_path_factory.mktemp("distilled")
+    with make_run(folder) as run:
+        for stage in (collect, stage1, stage2):
+            stage(run)
+    return folder
+
+
+@pytest.fixture
+def folder(distilled: Path, tmp_path: Path) -> Path:
+    """A copy of it for one test."""
+    return shutil.copytree(distilled, tmp_path / "run")
+
 
 # -- one-shot imitation ----------------------------------------------------------------------------
 
-IMITATE = ["imitate.composition=reach-lift", "imitate.demonstrations=2", "imitate.episodes=4"]
-FEW = "imitate.cloning_updates=50"  # where it does not matter how well a clone does
+IMITATE = ImitateSettings(
+    composition="reach-lift", demonstrations=2, episodes=4, cloning_updates=50
+)
 
 
 @pytest.mark.robosuite
 @pytest.mark.slow
 def test_imitation_compares_every_method_and_perturbation_and_goes_on(
-    run: Run, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import imitate
-
-    monkeypatch.setattr(imitate, "PERTURBATIONS", ("none", "both, constant"))
-    folder = Path(shutil.copytree(finished, tmp_path / "run"))
-    run(folder, imitate.imitate, *IMITATE, FEW)
-    with (folder / "imitation" / "results.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    monkeypatch.setattr(imitation, "PERTURBATIONS", ("none", "both, constant"))
+    said = study(folder, imitate, IMITATE)
+    rows = read(folder / "imitation" / "results.csv")
     cells = {(row["method"], row["perturbation"], row["demonstration"]) for row in rows}
-    assert len(cells) == len(imitate.METHODS) * 2 * 2
+    assert len(cells) == len(imitation.METHODS) * 2 * 2
     assert len(rows) == 2 * len(cells)
     assert {row["stages"] for row in rows} <= {"0", "1", "2"}
     assert all((row["stages"] == "2") == (row["success"] == "1") for row in rows)
     table = (folder / "tables" / "imitation.csv").read_text().splitlines()
     assert table[0] == "Method,Perturbation,1. Reach,2. Lift,Whole,95% interval,Episodes"
-    assert len(table) == 1 + len(imitate.METHODS) * 2
+    assert len(table) == 1 + len(imitation.METHODS) * 2
+    assert said == (folder / "tables" / "imitation.md").read_text()
 
     written = contents(folder, "imitation/*", "tables/imitation.*")
     (folder / "imitation" / "replay-none-1.csv").unlink()  # as a kill would leave it
-    run(folder, imitate.imitate, *IMITATE, FEW)
+    study(folder, imitate, IMITATE)
     assert contents(folder, "imitation/*", "tables/imitation.*") == written
 
     # A study is held to its own settings; the run's others stay free.
-    with pytest.raises(SystemExit):
-        run(folder, imitate.imitate, *IMITATE, FEW, "imitate.max_angle=10")
+    with pytest.raises(ConfigError, match=r"max_angle is 10\.0 here and 45\.0"):
+        study(folder, imitate, replace(IMITATE, max_angle=10.0))
 
 
 @pytest.mark.robosuite
 @pytest.mark.slow
-def test_what_drives_imitation_is_one_demonstration_from_another_start(
-    run: Run, finished: Path, tmp_path: Path
-) -> None:
-    import imitate
-
-    from torchrl_bmrl.data.demonstrations import read_statistics
-
-    settings = configured(*SMALL, *IMITATE, f"run_dir={tmp_path}", "workers=1")
-    config = OmegaConf.to_object(settings)
-    paths = [imitate.demonstrate(config, number) for number in (0, 1)]
-    statistics = read_statistics(finished / "data")
-    first, second = (imitate.read_demonstration(path, statistics) for path in paths)
+def test_what_drives_imitation_is_one_demonstration_from_another_start(folder: Path) -> None:
+    settings = replace(IMITATE, cloning_updates=2000)
+    run = make_run(folder)
+    task = run.composition("reach-lift")
+    first, second = (imitation.demonstrate(run, task, number) for number in (0, 1))
     assert first["stage"].unique().tolist() == second["stage"].unique().tolist() == [0, 1, 2]
     assert not torch.equal(first["observation"][0], second["observation"][0])
     # Open loop: the actions of the demonstration, whatever happens.
-    policy, (counter,) = imitate.make_method(config, "replay", paths[0], statistics)
-    from torchrl_bmrl.envs.transforms import make_env
-
-    played = make_env("reach-lift", statistics, counter).rollout(20, policy)
-    assert torch.equal(played["action"], first["action"][:20])
+    policy, (counter,) = imitation.make_method(run, settings, "replay", 0)
+    played = run.make_env(task, counter, num_envs=1).rollout(20, policy)
+    assert torch.equal(played["action"][0], first["action"][:20])
     # Cloning fits that demonstration.
-    clone, _ = imitate.make_method(config, "cloning", paths[0], statistics)
+    clone, _ = imitation.make_method(run, settings, "cloning", 0)
     error = (clone(first.select("observation"))["action"] - first["action"]).square().mean()
     assert error < 0.5 * first["action"].var(0).mean()
 
 
 @pytest.mark.parametrize(
-    ("overrides", "says"),
+    ("settings", "says"),
     [
-        (["imitate.composition=reach-push_up"], "imitate.composition is reach-push_up, but the"),
-        (["imitate.composition=reach-lfit"], "unknown task 'lfit'"),
-        (["imitate.episodes=7", "imitate.demonstrations=2"], "a multiple of"),
-        ([], "checkpoint.safetensors"),
+        (ImitateSettings(composition="reach-push_up"), "unknown task of the run 'push_up'"),
+        (ImitateSettings(composition="reach"), "imitate.composition is reach; valid: several"),
+        (ImitateSettings(episodes=7, demonstrations=2), "a multiple of"),
+        (ImitateSettings(magnitude=(1.5, 0.5)), "two factors, low to high"),
+        (ImitateSettings(), "checkpoint.safetensors"),
     ],
-    ids=["task the policy lacks", "no task", "uneven episodes", "no student"],
+    ids=["task that the run lacks", "one task", "uneven episodes", "range", "no student"],
 )
 def test_imitation_names_what_is_wrong_and_writes_no_study(
-    recipes: Any, tmp_path: Path, overrides: list[str], says: str, capsys: Any
+    tmp_path: Path, settings: ImitateSettings, says: str
 ) -> None:
     pytest.importorskip("robosuite", exc_type=ImportError)
-    import imitate
-
-    settings = configured(*SMALL, *overrides, f"run_dir={tmp_path}", "workers=1")
-    with pytest.raises(SystemExit):
-        recipes.run_recipe(settings, imitate.imitate)
-    assert says in capsys.readouterr().err
+    with pytest.raises(BMRLError, match=says):
+        study(tmp_path, imitate, settings)
     assert not (tmp_path / "imitation").exists()
+
+
+@pytest.mark.parametrize(
+    ("recipe", "override", "says"),
+    [
+        ("imitate", "imitate.composition=reach-lfit", "unknown task of the run 'lfit'"),
+        ("imitate", "imitate.magnitude=[0,1]", "imitate.magnitude is 0.0; valid: above 0"),
+        ("interpolate", "interpolation.task=push_up", "interpolation.task is push_up; valid: one"),
+        ("latent_sac", "latent_sac.seeds=[]", "latent_sac.seeds is []; valid: at least one"),
+        ("latent_sac", "latent_sac.random_steps=30000", "valid: 0 to environment_steps"),
+    ],
+)
+def test_the_recipes_take_a_studys_settings_from_the_command_line(
+    recipes: Any, tmp_path: Path, recipe: str, override: str, says: str, capsys: Any
+) -> None:
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    import importlib
+
+    main = importlib.import_module(recipe).main.__wrapped__
+    with pytest.raises(SystemExit, match="1"):
+        main(configured(*SMALL, override, f"run_dir={tmp_path}", "workers=1"))
+    error = capsys.readouterr().err
+    assert says in error
+    assert "Traceback" not in error
 
 
 # -- interpolation ---------------------------------------------------------------------------------
 
+INTERPOLATION = InterpolationSettings(episodes=4)
+
 
 @pytest.mark.robosuite
 @pytest.mark.slow
-def test_interpolation_plays_every_method_beside_what_it_is_compared_with(
-    run: Run,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    pytest.importorskip("matplotlib")
-    pytest.importorskip("sklearn")
-    import collect
-    import distill
-    import interpolate
-    import train_bcq
-
-    from torchrl_bmrl.evaluation import rollout
-
-    monkeypatch.setitem(rollout.rollout_episodes.__kwdefaults__, "max_steps", HORIZON)
-    options = ["collect.valid_episodes=2", "distill.task_latent_dim=3", "interpolation.episodes=4"]
-    for stage in (collect.collect, train_bcq.train_all, distill.distill, interpolate.interpolate):
-        run(tmp_path, stage, *options)
-
-    folder = tmp_path / "interpolation" / "lift-4"
-    rows = {path.stem: list(csv.DictReader(path.open())) for path in folder.glob("*.csv")}
-    noises = {f"{name}_noise" for name in interpolate.WITH_NOISE}
-    assert set(rows) == {*interpolate.METHODS, *noises, *interpolate.SWITCHES}
+def test_interpolation_plays_every_method_beside_what_it_is_compared_with(folder: Path) -> None:
+    said = study(folder, interpolate, INTERPOLATION)
+    kept = folder / "interpolation" / "lift-4"
+    rows = {path.stem: read(path) for path in kept.glob("*.csv")}
+    methods, switches = interpolation.METHODS, interpolation.SWITCHES
+    noises = {f"{name}_noise" for name in interpolation.WITH_NOISE}
+    assert set(rows) == {*methods, *noises, *switches}
     assert {len(part) for part in rows.values()} == {4 * HORIZON}
 
     def column(name: str, field: str) -> list[float]:
         return [float(row[field]) for row in rows[name]]
 
     # Lift starts 10 cm above the cube, whatever the method, from the same places.
-    for name in set(rows) - set(interpolate.SWITCHES):
+    for name in set(rows) - set(switches):
         starts = [row for row in rows[name] if row["step"] == "0"]
         for row, expected in zip(starts, rows["prototype"][::HORIZON], strict=True):
             assert float(row["eef_z"]) - float(row["goal_z"]) == pytest.approx(0.1, abs=1e-3)
@@ -165,44 +223,61 @@ def test_interpolation_plays_every_method_beside_what_it_is_compared_with(
     step = pytest.approx(1 / (HORIZON - 1), abs=1e-4)
     assert column("curve_moving", "along")[:2] == [0.0, step]
 
-    for name, lines in (("interpolation", len(interpolate.METHODS) + 2), ("switching", 3)):
-        table = (tmp_path / "tables" / f"{name}.csv").read_text().splitlines()
+    for name, lines in (("interpolation", len(methods) + 2), ("switching", 3)):
+        table = (folder / "tables" / f"{name}.csv").read_text().splitlines()
         assert len(table) == 1 + lines
-        page = (tmp_path / "tables" / f"{name}.md").read_text()
+        page = (folder / "tables" / f"{name}.md").read_text()
         assert f"\n| {table[1].split(',')[0]} | 4 |" in page
+        assert page in said
     for name in ("trajectories", "paths"):
-        picture = tmp_path / "figures" / f"interpolation_{name}.png"
+        picture = folder / "figures" / f"interpolation_{name}.png"
         assert picture.read_bytes()[1:4] == b"PNG"
 
-    before = contents(tmp_path, "interpolation/**/*", "tables/*", "figures/*")
-    written = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
-    (folder / "straight_noise.csv").unlink()
-    run(tmp_path, interpolate.interpolate, *options)
-    assert contents(tmp_path, "interpolation/**/*", "tables/*", "figures/*") == before
-    again = {path.stem for path in folder.iterdir() if path.stat().st_mtime_ns != written[path]}
+    before = contents(folder, "interpolation/**/*", "tables/*", "figures/*")
+    written = {path: path.stat().st_mtime_ns for path in kept.iterdir()}
+    (kept / "straight_noise.csv").unlink()
+    study(folder, interpolate, INTERPOLATION)
+    assert contents(folder, "interpolation/**/*", "tables/*", "figures/*") == before
+    again = {path.stem for path in kept.iterdir() if path.stat().st_mtime_ns != written[path]}
     assert again == {"straight", "straight_noise"}
-    for option, says in (
-        ("interpolation.task=push_up", "interpolation.task is push_up; valid: one of tasks"),
-        ("interpolation.episodes=1", "interpolation.episodes is 1; valid: at least one for each"),
-    ):
-        with pytest.raises(SystemExit):
-            run(tmp_path, interpolate.interpolate, *options, option)
-        assert says in capsys.readouterr().err
 
 
-def test_an_outcome_counts_as_neither_when_no_end_of_the_path_has_it(recipes: Any) -> None:
-    pytest.importorskip("robosuite", exc_type=ImportError)
-    pytest.importorskip("matplotlib")
-    import interpolation_report
+@pytest.mark.robosuite
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"task": "push_up"}, "interpolation.task is push_up; valid: one of tasks"),
+        ({"episodes": 1}, "interpolation.episodes is 1; valid: at least one for each"),
+        ({"cube": "robot0_eef_quat"}, "no position robot0_eef_quat"),
+        ({"eef": "hand"}, "no position hand"),
+    ],
+)
+def test_interpolation_names_a_setting_that_is_not_valid(
+    folder: Path, change: dict[str, Any], says: str
+) -> None:
+    with pytest.raises(ConfigError, match=says):
+        study(folder, interpolate, replace(INTERPOLATION, **change))
 
+
+@pytest.mark.robosuite
+@pytest.mark.slow
+def test_the_columns_of_a_position_are_found_in_the_demonstrations(distilled: Path) -> None:
+    run = make_run(distilled)
+    assert interpolation.position_columns(run, "lift", "robot0_eef_pos") == [23, 24, 25]
+    assert interpolation.position_columns(run, "reach", "goal_pos") == [30, 31, 32]
+
+
+def episodes(*labelled: tuple[str, tuple[float, ...]]) -> dict[str, Any]:
+    """Two steps of each episode, after which the cube is somewhere."""
+    cube = torch.zeros(len(labelled), 2, 3).numpy()
+    for i, (_, end) in enumerate(labelled):
+        cube[i, -1] = end
+    return {"cube": cube, "label": [label for label, _ in labelled]}
+
+
+def test_an_outcome_counts_as_neither_when_no_end_of_the_path_has_it() -> None:
     ends = {"lift": (0, 0, 0.1), "push_up": (0.1, 0, 0), "reach": (0, 0, 0)}
-
-    def episodes(*labelled: tuple[str, tuple[float, ...]]) -> dict[str, Any]:
-        cube = torch.zeros(len(labelled), 2, 3).numpy()
-        for i, (_, end) in enumerate(labelled):
-            cube[i, -1] = end
-        return {"cube": cube, "label": [label for label, _ in labelled]}
-
     # One push that failed does not make "still" usual.
     tasks = episodes(*ends.items(), *ends.items(), ("push_up", (0, 0, 0)))
     lift, up, still = ends.values()
@@ -211,32 +286,39 @@ def test_an_outcome_counts_as_neither_when_no_end_of_the_path_has_it(recipes: An
     assert share == "50%"
 
 
+@pytest.mark.parametrize(("end", "shown"), [((0, 0, 0), False), ((0, 0, 0.1), True)])
+def test_the_table_has_nothing_of_a_cube_that_never_moves(
+    end: tuple[float, ...], shown: bool
+) -> None:
+    still = {"eef": torch.zeros(1, 2, 3).numpy(), "deviation": torch.zeros(1, 2).numpy()}
+    played = {
+        "prototype": still | episodes(("", (0, 0, 0))),
+        "tasks": still | episodes(("reach", end)),
+    }
+    table = interpolation_report.method_table("reach", played, 20.0)
+    assert [row[-1] != "–" for row in table.rows] == [shown] * 2
+
+
 # -- learning on top -------------------------------------------------------------------------------
 
-SAC = (
-    "latent_sac.hold=5",
-    "latent_sac.environment_steps=250",
-    "latent_sac.random_steps=100",
-    "latent_sac.eval_interval=200",
-    "latent_sac.eval_episodes=2",
-    "latent_sac.num_candidates=3",
+SAC = LatentSACSettings(
+    hold=5,
+    environment_steps=250,
+    random_steps=100,
+    eval_interval=200,
+    eval_episodes=2,
+    num_candidates=3,
+    seeds=[4],
 )
 
 
 @pytest.mark.robosuite
 @pytest.mark.slow
-def test_sac_learns_on_top_of_a_finished_run_and_keeps_every_agent(
-    run: Run, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("matplotlib")
-    import latent_sac
-
-    folder = shutil.copytree(finished, tmp_path / "run")
+def test_sac_learns_on_top_of_a_finished_run_and_keeps_every_agent(folder: Path) -> None:
     before = times(folder)
-    run(folder, latent_sac.latent_sac, *SAC, "latent_sac.seeds=[4]")
+    said = study(folder, latent_sac, SAC)
     kept = folder / "latent_sac" / "reach-lift-hold5"
-    with (kept / "results.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = read(kept / "results.csv")
     # Chunks of 20 steps in five environments; evaluated before, from 200 on and at the end.
     assert [(row["variant"], row["environment_steps"]) for row in rows] == [
         ("latent", "0"),
@@ -247,41 +329,33 @@ def test_sac_learns_on_top_of_a_finished_run_and_keeps_every_agent(
         ("raw", "300"),
     ]
     assert all(0 <= float(row["success"]) <= 1 and 0 <= float(row["stages"]) <= 2 for row in rows)
-    table = (folder / "tables" / "latent_sac-reach-lift-hold5.md").read_text()
-    assert "| latent | 4 | not within 250 |" in table
+    assert said == (folder / "tables" / "latent_sac-reach-lift-hold5.md").read_text()
+    assert "| latent | 4 | not within 250 |" in said
     assert (folder / "figures" / "latent_sac-reach-lift-hold5.png").read_bytes()[1:4] == b"PNG"
     assert before.items() <= times(folder).items()  # the run itself is as it was
 
     agents = contents(kept, "*-seed4.csv")
     written = {path: path.stat().st_mtime_ns for path in kept.glob("*-seed4.csv")}
-    run(folder, latent_sac.latent_sac, *SAC, "latent_sac.seeds=[4,5]")
+    study(folder, latent_sac, replace(SAC, seeds=[4, 5]))
     assert {path: path.stat().st_mtime_ns for path in written} == written
     assert len(contents(kept, "*-seed*.csv")) == 2 * len(agents) == 4
-    capsys.readouterr()
-    with pytest.raises(SystemExit):
-        run(folder, latent_sac.latent_sac, *SAC, "latent_sac.eval_episodes=3")
-    assert "eval_episodes is 3 here and 2 in the folder's run" in capsys.readouterr().err
+    with pytest.raises(ConfigError, match="eval_episodes is 3 here and 2 in the folder's run"):
+        study(folder, latent_sac, replace(SAC, eval_episodes=3))
 
 
 @pytest.mark.robosuite
 @pytest.mark.slow
-def test_one_seed_learns_the_same_twice(run: Run, finished: Path, tmp_path: Path) -> None:
-    import latent_sac
-
+def test_one_seed_learns_the_same_twice(distilled: Path, tmp_path: Path) -> None:
     rows = []
     for name in ("a", "b"):
-        shutil.copytree(finished / "data", tmp_path / name / "data")
-        shutil.copytree(finished / "distill", tmp_path / name / "distill")
-        config = OmegaConf.to_object(configured(*SMALL, *SAC, f"run_dir={tmp_path / name}"))
-        latent_sac.train_job((config, "latent", 0), lambda count: None)
+        shutil.copytree(distilled / "data", tmp_path / name / "data")
+        shutil.copytree(distilled / "distill", tmp_path / name / "distill")
+        train_job((make_run(tmp_path / name), (SAC, "latent", 0)), lambda count: None)
         rows.append(contents(tmp_path / name, "latent_sac/*/*.csv"))
     assert rows[0] == rows[1] != {}
 
 
-def test_steps_to_half_are_those_of_the_first_evaluation_that_reaches_it(recipes: Any) -> None:
-    pytest.importorskip("matplotlib")
-    import latent_sac
-
+def test_steps_to_half_are_those_of_the_first_evaluation_that_reaches_it() -> None:
     def agent(*successes: float) -> list[dict[str, Any]]:
         return [
             {
@@ -294,9 +368,13 @@ def test_steps_to_half_are_those_of_the_first_evaluation_that_reaches_it(recipes
             for i, success in enumerate(successes)
         ]
 
-    assert latent_sac.steps_to_half(agent(0.0, 0.4, 0.5, 0.3, 0.9)) == 200
-    assert latent_sac.steps_to_half(agent(0.0, 0.4)) is None
-    config = OmegaConf.to_object(configured("preset=smoke", "run_dir=run"))
-    table = latent_sac.make_table(config, [agent(0.0, 0.6, 0.2), agent(0.1, 0.4)])
+    assert steps_to_half(agent(0.0, 0.4, 0.5, 0.3, 0.9)) == 200
+    assert steps_to_half(agent(0.0, 0.4)) is None
+    table = make_table(LatentSACSettings(), [agent(0.0, 0.6, 0.2), agent(0.1, 0.4)])
     assert table.rows[0] == ("latent", "3", "100", "0%", "60%", "20%", "0.4")
     assert table.rows[1][2] == "not within 20,000"
+
+
+def test_the_defaults_of_all_studies_are_valid() -> None:
+    for settings in (ImitateSettings(), InterpolationSettings(), LatentSACSettings()):
+        check_settings(settings)

@@ -92,7 +92,7 @@ class Task:
     compose: Callable[[Sequence[Task]], Task] | None = None
 
     def __post_init__(self) -> None:
-        parts = self.name.split("-") if self.compose else [self.name]
+        parts = self.stages if self.compose else (self.name,)
         if not all(_NAME.fullmatch(part) for part in parts):
             raise ConfigError(f"a task's name is {self.name!r}; valid: letters, digits, _ and .")
         if (self.record is None) == (self.files is None):
@@ -104,6 +104,11 @@ class Task:
             )
         if not self.title:
             object.__setattr__(self, "title", self.name.replace("_", " ").capitalize())
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """Names of the tasks that a composition does one after the other; its own for one task."""
+        return tuple(self.name.split("-"))
 
     def with_options(self, **options: Any) -> Task:
         """This task with some of its options replaced.
@@ -189,12 +194,15 @@ def compose_tasks(tasks: Sequence[Task]) -> Task:
     Args:
         tasks: in their order; a single task is returned as it is.
 
+    Returns:
+        a task whose name is theirs, joined by ``-``.
+
     Raises:
         ConfigError: if the tasks cannot follow each other.
 
     Example:
-        >>> compose_tasks([get_task("reach"), get_task("lift")]).name
-        'reach-lift'
+        >>> compose_tasks([get_task("reach"), get_task("lift")]).stages
+        ('reach', 'lift')
     """
     if len(tasks) == 1:
         return tasks[0]
@@ -202,4 +210,4 @@ def compose_tasks(tasks: Sequence[Task]) -> Task:
     if compose is None or any(task.compose != compose for task in tasks):
         names = ", ".join(task.name for task in tasks)
         raise ConfigError(f"the tasks {names} cannot follow each other in one episode")
-    return compose(tasks)
+    return replace(compose(tasks), name="-".join(task.name for task in tasks))

@@ -279,15 +279,15 @@ class Run:
             unit=unit,
         )
 
-    def make_env(self, name: str, *transforms: Transform, num_envs: int) -> TransformedEnv:
+    def make_env(self, task: Task, *transforms: Transform, num_envs: int) -> TransformedEnv:
         """A task's environment with this run's normalisation.
 
         Args:
-            name: of the task.
+            task: of this run, or one of its compositions.
             *transforms: appended, as in :func:`~torchrl_bmrl.envs.transforms.make_env`.
             num_envs: number of episodes side by side.
         """
-        return make_env(self.task(name), self.statistics, *transforms, num_envs=num_envs)
+        return make_env(task, self.statistics, *transforms, num_envs=num_envs)
 
     def play(
         self,

@@ -242,7 +242,7 @@ def _commit() -> str | None:
 
 
 def flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Settings by their dotted names.
+    """Settings by their dotted names; a tuple becomes a list, as in YAML.
 
     Example:
         >>> dict(flat({"seed": 0, "bcq": {"lr": 0.001}}))
@@ -252,4 +252,4 @@ def flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, A
         if isinstance(value, Mapping):
             yield from flat(value, f"{prefix}{key}.")
         else:
-            yield f"{prefix}{key}", value
+            yield f"{prefix}{key}", list(value) if isinstance(value, tuple) else value

@@ -1,4 +1,4 @@
-"""The tables and figures of ``interpolate.py``; ``docs/interpolation.md`` explains them."""
+"""Tables and figures of the interpolation study; ``docs/interpolation.md`` explains them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from torchrl_bmrl.envs.tasks import CONTROL_FREQUENCY
 from torchrl_bmrl.evaluation import bootstrap_interval
 from torchrl_bmrl.evaluation.behaviour import (
     CUBE_OUTCOMES,
@@ -18,13 +17,7 @@ from torchrl_bmrl.evaluation.behaviour import (
     occupied_cells,
     spread,
 )
-from torchrl_bmrl.reports import (
-    Picture,
-    Table,
-    behaviour_trajectories,
-    embedding_paths,
-    task_name,
-)
+from torchrl_bmrl.reports import Picture, Table, behaviour_trajectories, embedding_paths
 from torchrl_bmrl.reports.tables import MISSING
 
 METHODS = {
@@ -36,7 +29,7 @@ METHODS = {
     "curve_moving": "Along curves on the data in time",
     "actions": "Random actions",
 }
-"""Where m comes from, or the action, by the method's name."""
+"""Titles of the methods: where m comes from, or the action."""
 SWITCHES = {
     "stay": "One demonstration to the end",
     "switch": "Another one from halfway on",
@@ -53,7 +46,7 @@ Episodes = Mapping[str, np.ndarray]
 
 
 def moved(episodes: Episodes, name: str) -> np.ndarray:
-    """Positions relative to where each episode began: the starts differ, and are no behaviour."""
+    """Positions relative to each episode's start, because starts are not behaviour."""
     return episodes[name] - episodes[name][:, :1]
 
 
@@ -64,58 +57,54 @@ def with_interval(values: np.ndarray, form: str) -> str:
 
 
 def share_of_neither(task: str, episodes: Episodes, tasks: Episodes) -> str:
-    """Share of episodes in which the cube fares as at neither end of the episode's path."""
+    """Share of episodes whose outcome is usual at neither end of the episode's path."""
     labels = list(zip(tasks["label"], cube_outcomes(moved(tasks, "cube")), strict=True))
     usual = {
         other: Counter(outcome for label, outcome in labels if label == other).most_common(1)[0][0]
         for other in {label for label, _ in labels}
     }
-    ends = {other: (usual[task], usual[other]) for other in usual}
     outcomes = zip(episodes["label"], cube_outcomes(moved(episodes, "cube")), strict=True)
-    return f"{np.mean([outcome not in ends[label] for label, outcome in outcomes]):.0%}"
+    neither = [outcome not in (usual[task], usual[label]) for label, outcome in outcomes]
+    return f"{np.mean(neither):.0%}"
 
 
-def method_table(task: str, played: Mapping[str, Episodes]) -> Table:
-    """Behaviour of every method, one line each."""
+def method_table(task: str, played: Mapping[str, Episodes], frequency: float) -> Table:
+    """Behaviour of every method, one line each; nothing of a cube that no episode moves."""
     group = min(GROUP, len(played["prototype"]["eef"]))
     known = {tuple(cell) for cell in occupied_cells(moved(played["tasks"], "eef"), CELL)}
+    has_cube = any(moved(episodes, "cube").any() for episodes in played.values())
     lines = []
     for name, episodes in played.items():
-        eef = moved(episodes, "eef")
+        eef, cube = moved(episodes, "eef"), moved(episodes, "cube")
         cells = {tuple(cell) for cell in occupied_cells(eef, CELL)}
+        title = METHODS[name.removesuffix("_noise")]
         if name.endswith("_noise"):
-            title = f"Action noise, as far as: {METHODS[name.removesuffix('_noise')].lower()}"
-        else:
-            title = METHODS[name]
+            title = f"Action noise, as far as: {title.lower()}"
         line = [title, str(len(eef)), f"{episodes['deviation'].mean():.2f}"]
         line += [with_interval(group_coverage(eef, CELL, group_size=group), ".0f")]
         line += [str(len(cells)), str(len(cells - known)), f"{spread(eef[:, -1]):.3f}"]
-        line += [with_interval(mean_speed(eef, 1 / CONTROL_FREQUENCY), ".3f")]
-        if task != "reach":
-            displacement = moved(episodes, "cube")
-            covered = group_coverage(displacement, CELL, group_size=group)
-            outcomes = cube_outcomes(displacement)
+        line += [with_interval(mean_speed(eef, 1 / frequency), ".3f")]
+        if has_cube:
+            outcomes = cube_outcomes(cube)
             shares = {kind: outcomes.count(kind) / len(outcomes) for kind in CUBE_OUTCOMES}
-            line += [with_interval(covered, ".0f"), f"{1 - shares['still']:.0%}"]
-            line += [f"{effective_number(outcomes):.1f}"]
+            line += [with_interval(group_coverage(cube, CELL, group_size=group), ".0f")]
+            line += [f"{1 - shares['still']:.0%}", f"{effective_number(outcomes):.1f}"]
             between = name in ("straight", "curve", "curve_moving")
             line += [share_of_neither(task, episodes, played["tasks"]) if between else MISSING]
             line += [", ".join(f"{kind} {x:.0%}" for kind, x in shares.items() if x)]
-        else:
-            line += [MISSING] * 5
-        lines.append(line)
+        lines.append(line if has_cube else [*line, *[MISSING] * 5])
     return Table(
         title=f"Interpolation as exploration, in the scene of {task}",
         caption=(
-            "Size: mean norm of the executed action minus the policy's at the scene's prototype "
-            f"in the same state, from the same proposals. Cells: of {CELL * 100:.0f} cm, of "
-            f"positions relative to the episode's start; “cells of {group}” are those that "
-            f"{group} episodes occupy together. New: cells of all episodes in which no episode of "
-            "any task's prototype was. Spread: root mean square distance of the final "
-            "end-effector positions from their mean. Kinds: effective number of outcomes, of what "
-            f"may become of the cube: {', '.join(CUBE_OUTCOMES)}. Neither: episodes with an "
-            "outcome that is usual at neither end of their path. "
-            "Brackets: 95% bootstrap intervals over episodes, or over groups."
+            "Size: mean norm of the difference between the executed action and the policy's at "
+            "the scene's prototype, in the same state with the same proposals. Cells: of "
+            f"{CELL * 100:.0f} cm, of positions relative to the episode's start; “cells of "
+            f"{group}” are those that {group} episodes occupy together. New: cells of all episodes "
+            "that no episode of a task's prototype occupies. Spread: root mean square distance of "
+            "the final end-effector positions from their mean. Kinds: effective number of the "
+            f"cube's outcomes, which are {', '.join(CUBE_OUTCOMES)}. Neither: episodes with an "
+            "outcome that is usual at neither end of their path. Brackets: 95% bootstrap "
+            "intervals over episodes, or over groups."
         ),
         header=(
             "Method", "Episodes", "Size", f"Cells of {group}", "Cells of all", "New",
@@ -126,35 +115,28 @@ def method_table(task: str, played: Mapping[str, Episodes]) -> Table:
     )  # fmt: skip
 
 
-def switching_table(played: Mapping[str, Episodes]) -> Table:
-    """Whether reach episodes arrive, with and without a switch."""
+def switching_table(title: str, played: Mapping[str, Episodes], frequency: float) -> Table:
+    """Whether episodes of a task succeed, with and without a switch."""
     lines = []
     for name, episodes in played.items():
         success = episodes["success"].astype(bool)
         leaving = episodes["label"].astype(int)
-        early = [success[i, : leaving[i]].any() for i in range(len(success))]
+        early = sum(success[i, : leaving[i]].any() for i in range(len(success)))
         apart = np.linalg.norm(episodes["eef"] - played["stay"]["eef"], axis=-1)
-        first = success.argmax(1)[success.any(1)] / CONTROL_FREQUENCY
-        lines.append(
-            [
-                SWITCHES[name],
-                str(len(success)),
-                with_interval(success.any(1).astype(float), ".2f"),
-                with_interval(success[:, -1].astype(float), ".2f"),
-                str(sum(early)),
-                f"{np.median(first):.2f}" if len(first) else MISSING,
-                f"{apart.max(1).mean():.4f}",
-            ]
-        )
+        first = success.argmax(1)[success.any(1)] / frequency
+        line = [SWITCHES[name], str(len(success))]
+        line += [with_interval(x.astype(float), ".2f") for x in (success.any(1), success[:, -1])]
+        line += [str(early), f"{np.median(first):.2f}" if len(first) else MISSING]
+        lines.append([*line, f"{apart.max(1).mean():.4f}"])
     return Table(
-        title="From one reach trajectory to another",
+        title=f"From one {title.lower()} trajectory to another",
         caption=(
-            "Reach episodes from new starts to new goals, driven by the embeddings of held-out "
-            f"demonstrations; halfway to the first one's success m goes in {SWITCH_STEPS} steps "
-            "along a straight line to the second one's. Arrived: within 2 cm of the episode's own "
-            "goal at some step; there: at the last one. Apart: the end-effector's largest distance "
-            "from where it is without leaving, mean over episodes; where that is next to nothing, "
-            "two demonstrations are one behaviour. Brackets: 95% bootstrap intervals."
+            f"{title} episodes from new starts to new goals, driven by the embeddings of held-out "
+            "demonstrations. Halfway to the first one's success m moves to the second one's in "
+            f"{SWITCH_STEPS} steps along a straight line. Arrived: the task succeeds at some step; "
+            "there: at the last one. Apart: the end-effector's largest distance from its position "
+            "without a switch, mean over episodes; if it is close to zero, two demonstrations are "
+            "one behaviour. Brackets: 95% bootstrap intervals."
         ),
         header=(
             "m", "Episodes", "Arrived", "There at the end", "Arrived before", "After [s]",
@@ -170,12 +152,12 @@ def make_pictures(
     paths: Mapping[str, Sequence[np.ndarray]],
     random: np.ndarray,
 ) -> dict[str, Picture]:
-    """The two figures by the name of their file.
+    """The two figures by file name.
 
     Args:
         played: episodes of every method.
-        embeddings: of training transitions by task, ``(N, m)``.
-        paths: by kind, from the scene's prototype to every other, ``(T, m)``.
+        embeddings: of training transitions by the task's title, ``(N, m)``.
+        paths: by kind, from the scene's prototype to every other one, ``(T, m)``.
         random: points of the embedding, ``(N, m)``.
     """
     shown = ["prototype", "tasks", "straight", "straight_noise", "curve", "random"]
@@ -185,23 +167,22 @@ def make_pictures(
     )
     points = list(embeddings.values())
     index = np.repeat(np.arange(len(points)), list(map(len, points)))
-    titles = list(map(task_name, embeddings))
-    drawn = embedding_paths(np.concatenate(points), index, titles, paths, random)
+    drawn = embedding_paths(np.concatenate(points), index, list(embeddings), paths, random)
     return {
         "interpolation_trajectories": Picture(
             png=trajectories,
-            alt="Ways of the end-effector, one panel per method",
+            alt="Trajectories of the end-effector, one panel per method",
             caption=(
-                "Ways of the end-effector from its start, seen from above and from behind; the "
-                "colour says where on its path between two tasks an episode's m lies."
+                "Trajectories of the end-effector from its start, from above and from behind. The "
+                "colour is the position of an episode's m on its path between two tasks."
             ),
         ),
         "interpolation_paths": Picture(
             png=drawn,
             alt="Embeddings by task, with lines and curves between the tasks' prototypes",
             caption=(
-                "Where the episodes' m lie: straight lines, curves over the training transitions, "
-                "and random points of the embedding."
+                "The episodes' m: straight lines, curves over the training transitions, and random "
+                "points of the embedding."
             ),
         ),
     }
