@@ -45,7 +45,7 @@ from torchrl_bmrl.evaluation.rollout import evaluate_policy
 from torchrl_bmrl.experts.collect import collect_episode
 from torchrl_bmrl.files import read_rows, whole, write_rows
 from torchrl_bmrl.modules import DemonstrationTaskLatent, StageTaskLatent
-from torchrl_bmrl.modules.task_latent import ALIGNMENTS
+from torchrl_bmrl.modules.demonstration_latent import ALIGNMENTS
 from torchrl_bmrl.names import composition_stages, horizon_of
 from torchrl_bmrl.pipeline.agents import load_student
 from torchrl_bmrl.reports.page import Section
