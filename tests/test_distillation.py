@@ -29,7 +29,6 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_bmrl import functional
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.functional import triplet_error
 from torchrl_bmrl.modules import PLASPolicy, make_decoder, make_qvalue_network
