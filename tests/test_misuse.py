@@ -146,7 +146,7 @@ def test_a_latent_of_another_size_than_the_decoders_is_refused(latent_dim: int) 
     decoder = make_decoder(*DIMS, LATENT_DIM)
     with refused(f"latent_dim is {latent_dim}; valid: 4, the generator's"):
         BCQPolicy(decoder, make_qvalue_network(*DIMS), latent_dim=latent_dim)
-    with refused("latent_dim is None and the decoder does not say it"):
+    with refused("latent_dim is None and the decoder does not declare it"):
         BCQPolicy(undeclared(decoder), make_qvalue_network(*DIMS))
     assert BCQPolicy(decoder, make_qvalue_network(*DIMS)).latent_dim == LATENT_DIM
 

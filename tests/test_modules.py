@@ -352,7 +352,7 @@ def test_prototype_is_the_mean_or_the_medoid() -> None:
 @pytest.mark.parametrize(
     ("points", "kind", "message"),
     [
-        (torch.zeros(3, 2), "mode", "valid: mean, medoid"),
+        (torch.zeros(3, 2), "mode", "valid prototypes: mean, medoid"),
         (torch.zeros(0, 2), "mean", "at least one"),
     ],
 )

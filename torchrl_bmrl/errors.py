@@ -1,4 +1,4 @@
-"""Errors that this library raises on purpose; all derive from :class:`BMRLError`."""
+"""Errors of this library; all derive from :class:`BMRLError`."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ class ConfigError(BMRLError):
 
 
 class UnknownNameError(BMRLError):
-    """A name that is none of the valid choices.
+    """A name that is not one of the valid choices.
 
     Args:
-        kind: what the name stands for, such as ``"task"``.
-        value: the name that was given.
-        valid: the names that would have been accepted.
+        kind: what is named, such as ``"task"``.
+        value: the given name.
+        valid: the valid names.
 
     Example:
         >>> print(UnknownNameError("task", "lft", ["reach", "lift"]))
@@ -55,12 +55,12 @@ class UnknownNameError(BMRLError):
 
 
 class MissingExtraError(BMRLError, ImportError):
-    """A package that is not installed, or not usable, of one of this library's extras.
+    """A package of one of this library's extras that is not installed, or not usable.
 
     Args:
-        package: what cannot be imported.
-        extra: the extra that brings it.
-        reason: why not, where it is there; ``None`` where it is not.
+        package: the package.
+        extra: the extra that installs it.
+        reason: why it is not usable; ``None`` if it is not installed.
 
     Example:
         >>> print(MissingExtraError("h5py", "data"))
@@ -86,8 +86,8 @@ class DataError(BMRLError):
 
     Args:
         path: the file.
-        key: the group, dataset or attribute at fault; ``None`` for the file as a whole.
-        message: what is wrong with it.
+        key: the group, dataset or attribute that is wrong; ``None`` for the file as a whole.
+        message: what is wrong.
 
     Example:
         >>> print(DataError("lift.hdf5", "data/demo_0/rewards", "not a number in row 3"))
@@ -106,11 +106,11 @@ class DataError(BMRLError):
 
 
 class CheckpointError(BMRLError):
-    """A checkpoint that cannot be read, or does not fit the networks that it is loaded into.
+    """A checkpoint that cannot be read, or does not fit the networks.
 
     Args:
         path: the checkpoint.
-        message: what is wrong with it.
+        message: what is wrong.
 
     Example:
         >>> print(CheckpointError("runs/lift.safetensors", "no such file"))
@@ -127,10 +127,10 @@ class CheckpointError(BMRLError):
 
 
 class RenderError(BMRLError):
-    """Pictures that cannot be made here: no graphics library works.
+    """Pictures that cannot be rendered because no graphics library works.
 
     Args:
-        problems: what each library that was tried said.
+        problems: the error of each library that was tried.
 
     Example:
         >>> print(RenderError(["egl: no such library"]))
@@ -146,12 +146,12 @@ class RenderError(BMRLError):
 
 
 class FolderInUseError(BMRLError):
-    """A run folder that another process works in.
+    """A run folder that another process uses.
 
     Args:
         folder: the folder.
-        process: number of the process that holds it.
-        host: the machine that it runs on.
+        process: number of that process.
+        host: the machine of that process.
 
     Example:
         >>> print(FolderInUseError("runs/a", 4711, "node3"))
@@ -172,10 +172,10 @@ class FolderInUseError(BMRLError):
 
 
 class StoppedError(BMRLError):
-    """A run that was asked to stop.
+    """A run that was stopped by a signal.
 
     Args:
-        signal: that asked.
+        signal: the signal.
 
     Example:
         >>> print(StoppedError(signal.SIGTERM))

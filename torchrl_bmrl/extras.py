@@ -1,4 +1,4 @@
-"""Imports of packages that an extra brings."""
+"""Imports of packages that belong to an extra."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from torchrl_bmrl.errors import MissingExtraError
 
 @contextmanager
 def needs(extra: str) -> Iterator[None]:
-    """Names the extra where an import inside fails.
+    """Context for imports of an extra's packages: a failing import names the extra.
 
     Args:
         extra: of this library, such as ``"data"``.
 
     Raises:
-        MissingExtraError: naming the package and the extra, with the reason where the package is
-            installed and fails.
+        MissingExtraError: naming the package and the extra, and the reason if the package is
+            installed but fails.
 
     Example:
         >>> with needs("data"):
@@ -30,7 +30,7 @@ def needs(extra: str) -> Iterator[None]:
     try:
         yield
     except MissingExtraError:
-        raise  # of a module of this library, which names its own
+        raise  # from a module of this library, which has named its own extra
     except ImportError as error:
         name = (error.name or "").partition(".")[0]
         if name == "torchrl_bmrl":

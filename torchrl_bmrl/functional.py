@@ -1,4 +1,4 @@
-r"""The equations of the losses: one function each, on plain tensors.
+r"""The equations of the losses, each as one function of plain tensors.
 
 Leading dimensions are written ``*B``. Every function is differentiable in its tensor arguments.
 
@@ -48,8 +48,8 @@ def sample_action_latent(
 ) -> Tensor:
     r"""Draws the VAE's latent for action proposals, z ~ N(0, I) clipped to ± ``latent_clip``.
 
-    The draw is explicit because inside a TorchRL loss a probabilistic module returns its mean, and
-    all proposals would be the same.
+    The draw is explicit because inside a TorchRL loss a probabilistic module returns its mean, so
+    that all proposals would be equal.
 
     Reference: BCQ.
 
@@ -60,7 +60,7 @@ def sample_action_latent(
         dtype: of the sample.
 
     Returns:
-        z, of the shape that was asked for.
+        z, of the given shape.
 
     Example:
         >>> z = sample_action_latent((1000, 14), latent_clip=0.5)
@@ -81,7 +81,7 @@ def perturbed_action(
     low: Tensor,
     high: Tensor,
 ) -> Tensor:
-    r"""Action moved by the perturbation network within the action's bounds.
+    r"""Action plus the output of the perturbation network, clipped to the action's bounds.
 
     .. math:: a' = \mathrm{clip}(a + \phi\, h\, \xi(s, a),\ a_{low},\ a_{high}),\quad
               h = (a_{high} - a_{low}) / 2
@@ -108,7 +108,7 @@ def perturbed_action(
 
 
 def soft_clipped_value(state_action_value: Tensor, lmbda: float | Tensor) -> Tensor:
-    r"""Soft clipped double-Q: between the ensemble's minimum and maximum.
+    r"""Soft clipped double-Q: a weighted mean of the ensemble's minimum and maximum.
 
     .. math:: \lambda \min_j Q_j + (1 - \lambda) \max_j Q_j
 
@@ -129,7 +129,7 @@ def soft_clipped_value(state_action_value: Tensor, lmbda: float | Tensor) -> Ten
 
 
 def bcq_next_value(state_action_value: Tensor, lmbda: float | Tensor) -> Tensor:
-    r"""BCQ's value of a next state: the best candidate under the soft clipped double-Q.
+    r"""BCQ's value of a next state: the soft clipped double-Q of the best candidate.
 
     .. math:: V(s') = \max_i [\lambda \min_j Q_j(s', a_i) + (1 - \lambda) \max_j Q_j(s', a_i)]
 
@@ -151,7 +151,7 @@ def bcq_next_value(state_action_value: Tensor, lmbda: float | Tensor) -> Tensor:
 
 
 def likely_actions(logits: Tensor, threshold: float | Tensor) -> Tensor:
-    r"""Actions that are likely enough, measured by the likeliest one.
+    r"""Mask of the actions that are likely enough, compared with the likeliest one.
 
     .. math:: \frac{G(a|s)}{\max_{a'} G(a'|s)} > \tau
 
@@ -159,7 +159,7 @@ def likely_actions(logits: Tensor, threshold: float | Tensor) -> Tensor:
 
     Args:
         logits: of the behaviour's classifier, ``(*B, num_actions)``.
-        threshold: τ in [0, 1]. The likeliest action is always one of them.
+        threshold: τ in [0, 1]. The likeliest action always passes.
 
     Returns:
         boolean, ``(*B, num_actions)``.
@@ -192,14 +192,14 @@ def squared_error(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def triplet_error(anchor: Tensor, positive: Tensor, negative: Tensor, margin: float) -> Tensor:
-    r"""How far an embedding is from having its own kind nearer than others by a margin.
+    r"""Triplet loss: an embedding of the same task should be nearer than one of another task.
 
     .. math:: \max(0,\ \lVert m - m^+ \rVert - \lVert m - m^- \rVert + \alpha)
 
     Reference: Li et al., *Multi-task Batch Reinforcement Learning with Metric Learning*, NeurIPS
     2020, https://arxiv.org/abs/1909.11373.
 
-    PyTorch's distance adds 1e-6 to every difference, for a gradient where two points meet.
+    PyTorch's distance adds 1e-6 to every difference, so that equal points have a gradient.
 
     Args:
         anchor: m, ``(*B, n)``.
@@ -220,7 +220,7 @@ def triplet_error(anchor: Tensor, positive: Tensor, negative: Tensor, margin: fl
 
 
 def isometry_error(task_latent: Tensor, content: Tensor, valid: Tensor | None = None) -> Tensor:
-    r"""How far distances in an embedding are from those of what it embeds.
+    r"""Mean squared difference between distances in an embedding and in its content.
 
     .. math:: \frac{1}{n} \sum_j \left(\lVert m_i - m_j \rVert - \lVert c_i - c_j \rVert\right)^2
 
@@ -233,7 +233,7 @@ def isometry_error(task_latent: Tensor, content: Tensor, valid: Tensor | None = 
         valid: which rows count as j, ``(*B, n)``; ``None`` if all do.
 
     Returns:
-        ``(*B, n)``; finite gradients also where two points meet.
+        ``(*B, n)``; its gradients are finite also for equal points.
 
     Example:
         >>> content = torch.tensor([[0.0], [3.0]])
@@ -274,14 +274,14 @@ def direction_error(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def mean_and_scale(values: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Mean and standard deviation to normalise with, finite for whatever finite numbers.
+    r"""Mean and standard deviation for normalising; finite for all finite numbers.
 
     .. math:: \mu = \frac{1}{N} \sum_i x_i, \qquad
               \sigma = \sqrt{\frac{1}{N} \sum_i (x_i - \mu)^2},
-              \text{ or } 1 \text{ where all } x_i \text{ are one number but for rounding}
+              \text{ or } 1 \text{ where all } x_i \text{ are equal up to rounding}
 
-    (:func:`nonzero_scale`). Sums are float64 and of differences from the first row, in two passes
-    over parts of the data: a small spread around a large number keeps its digits.
+    (:func:`nonzero_scale`). The sums are float64, over differences from the first row, in two
+    passes over chunks of the data, so that a small spread around a large number keeps its digits.
 
     Args:
         values: floating-point numbers, ``(N, n)``, finite, N of at least 1.
@@ -305,16 +305,16 @@ def mean_and_scale(values: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def nonzero_scale(scale: Tensor, largest: Tensor, dtype: torch.dtype) -> Tensor:
-    """Standard deviations that can be divided by: 1 in place of those that are rounding alone.
+    """Standard deviations to divide by, with 1 in place of those that are only rounding errors.
 
-    That is what they are up to two units in the last place of the largest number and, as what is
-    computed from numbers around 1 is off by so much however small it is itself, up to 1e-7, or
-    1e-12 in float64.
+    A standard deviation counts as rounding error up to two units in the last place of the largest
+    number, and up to 1e-7 (float64: 1e-12) in any case: results computed from numbers around 1 have
+    errors of this size, even if they are small themselves.
 
     Args:
         scale: standard deviations, ``(*B)``.
-        largest: magnitude of the numbers that they are of, ``(*B)``.
-        dtype: of these numbers.
+        largest: largest magnitude of the numbers, ``(*B)``.
+        dtype: of the numbers.
 
     Example:
         >>> nonzero_scale(torch.tensor([0.0, 1e-17, 0.5]), torch.ones(3), torch.float64)

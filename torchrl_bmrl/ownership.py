@@ -1,4 +1,4 @@
-"""Networks that a loss has copied: what they are used for afterwards would never learn."""
+"""Networks that a loss has copied: the originals stay untrained and must not be used."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ _COPIED: WeakKeyDictionary[nn.Module, str] = WeakKeyDictionary()
 
 
 def note_copied(network: nn.Module, loss: str) -> None:
-    """Notes that a loss trains a copy of a network, and not the network itself or its parts.
+    """Records that a loss trains a copy of a network, and not the network or its parts.
 
     Args:
-        network: as the user gave it.
+        network: the original.
         loss: name of the loss's class.
 
     Example:
         >>> note_copied(nn.Linear(1, 1), "BCQLoss")
     """
     for part in network.modules():
-        if next(part.parameters(), None) is not None:  # an activation may serve other networks, too
+        if next(part.parameters(), None) is not None:  # an activation may be part of other networks
             _COPIED[part] = loss
 
 
 def is_copied(network: nn.Module) -> bool:
-    """Whether a loss trains a copy of a network, or a stack of losses that of a loss.
+    """Whether a loss trains a copy of this network, or a stack a copy of this loss.
 
     Args:
         network: the network or loss.
@@ -41,14 +41,14 @@ def is_copied(network: nn.Module) -> bool:
 
 
 def check_trained(name: str, network: Any) -> None:
-    """Refuses a network that stays as it was while a loss trains its copy.
+    """Checks that a network is not the untrained original of a loss's copy.
 
     Args:
-        name: of the argument that the network was given as.
-        network: to be used.
+        name: of the argument, for the message.
+        network: the network.
 
     Raises:
-        BMRLError: naming what to use in its place.
+        BMRLError: naming what to use instead.
 
     Example:
         >>> critic = nn.Linear(1, 1)

@@ -205,15 +205,12 @@ class Outside:
 
 def variants(rows: int, device: str, members: list[int]) -> dict[str, tuple[Update, int]]:
     """By name, an update and for how many members it counts."""
-    bfloat16 = {"target_dtype": "bfloat16"}
     made: dict[str, tuple[Update, int]] = {
         LIMIT: (make_products(rows, device), 1),
         PLAIN: (make_plain_update(device), 1),
         "plain PyTorch, compiled": (make_plain_update(device, compiled=True), 1),
         "BCQLoss": (make_alone(device), 1),
         "BCQLoss, compiled": (make_alone(device, "compiled"), 1),
-        "BCQLoss, bfloat16 targets": (make_alone(device, **bfloat16), 1),
-        "BCQLoss, bfloat16 targets, compiled": (make_alone(device, "compiled", **bfloat16), 1),
         "BCQLoss with perturbation": (make_alone(device, perturbation=True), 1),
         "BCQLoss with perturbation, compiled": (
             make_alone(device, "compiled", perturbation=True),

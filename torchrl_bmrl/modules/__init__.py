@@ -1,5 +1,6 @@
 """Networks, policies, and the task embedding."""
 
+from torchrl_bmrl.modules.demonstration_latent import DemonstrationTaskLatent
 from torchrl_bmrl.modules.discrete_policy import DiscreteBCQPolicy
 from torchrl_bmrl.modules.following import LossPolicy, extract_critic, extract_network
 from torchrl_bmrl.modules.generator import (
@@ -12,7 +13,6 @@ from torchrl_bmrl.modules.generator import (
 from torchrl_bmrl.modules.latent_action import HeldTaskLatent, task_latent_box
 from torchrl_bmrl.modules.policy import BCQPolicy, PLASPolicy
 from torchrl_bmrl.modules.task_latent import (
-    DemonstrationTaskLatent,
     OnlineTaskLatent,
     PathTaskLatent,
     PrototypeTaskLatent,

@@ -1,4 +1,4 @@
-"""Acting in the task embedding: an environment whose action is m, executed by a frozen policy."""
+"""Environments whose action is the task embedding m, which a frozen policy executes."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from torchrl_bmrl.errors import BMRLError
 
 
 def task_latent_box(task_latent: Tensor, *, share: float = 0.98) -> tuple[Tensor, Tensor]:
-    """The box that holds the middle of every coordinate of the embeddings.
+    """The box that contains the middle share of the embeddings in every coordinate.
 
     Args:
         task_latent: embeddings of the training transitions, ``(N, m)``.
-        share: of them, in each coordinate; what lies outside on either side is left out alike.
+        share: of the embeddings, in each coordinate; the rest is cut off equally on both sides.
 
     Returns:
         lower and upper corner, ``(m,)`` each.
 
     Raises:
-        BMRLError: for a share outside (0, 1], or embeddings that span no box.
+        BMRLError: for a share outside (0, 1], or embeddings without extent.
 
     Example:
         >>> low, high = task_latent_box(torch.arange(101.0).unsqueeze(-1))
@@ -54,12 +54,11 @@ class HeldTaskLatent(Transform):
     hold ends early where the episode does, with the observation that it ended on. An agent that
     discounts a step by γ discounts a decision by :math:`\gamma^k`.
 
-    (``FrameSkipTransform`` repeats an action and ``MultiAction`` takes several chosen in advance;
-    here the policy sees every step.)
+    (``FrameSkipTransform`` repeats an action and ``MultiAction`` takes several actions chosen in
+    advance; here the policy sees every step.)
 
-    It sees what the transforms before it wrote; those after it see decisions. In a batch, episodes
-    that ended within a hold are stepped on by environments that step all of theirs, and what comes
-    of that is dropped.
+    Transforms before it act on every step, those after it on every decision. Batched environments
+    step all episodes, also those that have ended within the hold; these results are discarded.
 
     Reference: *Compositional Skill Learning Using Batch Meta RL*, section 7.5.
 
@@ -68,7 +67,7 @@ class HeldTaskLatent(Transform):
             passes through it.
         low: least m, ``(m,)``; see :func:`task_latent_box`.
         high: greatest m, ``(m,)``.
-        hold: k, steps that an m is held.
+        hold: k, steps for which an m is used.
 
     Keys read: ``action (*B, m)``, and what the policy reads. Keys written: the environment's own
     after the last step, ``("next", "reward")`` (a sum) and ``held_steps (*B, 1)`` int64, the
@@ -161,7 +160,7 @@ class HeldTaskLatent(Transform):
         return input_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Adds ``held_steps``; the policy acts once, so that an m that it cannot take is named.
+        """Adds ``held_steps``, after a trial action of the policy with an m of this size.
 
         Raises:
             BMRLError: if the policy was made for an m of another size.

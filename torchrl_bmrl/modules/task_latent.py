@@ -1,8 +1,8 @@
-"""The task embedding m: the encoder that makes it, and where m comes from when acting.
+"""The task embedding m: its encoder, and transforms that write it for an acting policy.
 
-Training embeds a transition (s, a, r, s'); an acting policy does not have the present one yet.
-Environment transforms write ``task_latent`` for it: :class:`PrototypeTaskLatent`,
-:class:`OnlineTaskLatent`, :class:`DemonstrationTaskLatent` and :class:`PathTaskLatent`.
+Training embeds a transition (s, a, r, s'). An acting policy does not have the present transition
+yet, so an environment transform writes ``task_latent`` for it: :class:`PrototypeTaskLatent`,
+:class:`OnlineTaskLatent`, :class:`PathTaskLatent` or :class:`DemonstrationTaskLatent`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.modules.generator import Network, make_mlp
 
 TRANSITION_KEYS = ("observation", "action", ("next", "reward"), ("next", "observation"))
-"""What the task encoder reads, in this order."""
+"""Keys that the task encoder reads, in this order."""
 
 
 def make_task_encoder(
@@ -53,12 +53,13 @@ def make_task_encoder(
 
 
 def make_one_hot_encoder(num_tasks: int) -> TensorDictModule:
-    """In place of :func:`make_task_encoder`: m is the task's index, one-hot; nothing is learned.
+    """Encoder that writes the task's index, one-hot, as m; it has no parameters.
 
-    Reads ``task (*B,)``, int64; writes ``task_latent (*B, num_tasks)``.
+    It replaces :func:`make_task_encoder` in an ablation. It reads ``task (*B,)``, int64, and writes
+    ``task_latent (*B, num_tasks)``.
 
     Args:
-        num_tasks: number of tasks; ``task`` is below it.
+        num_tasks: number of tasks; ``task`` is smaller.
 
     Example:
         >>> make_one_hot_encoder(3)(TensorDict({"task": torch.tensor([2])}, [1])).get("task_latent")
@@ -83,7 +84,7 @@ def make_task_classifier(num_tasks: int, task_latent_dim: int = 2) -> TensorDict
     Reference: *Compositional Skill Learning Using Batch Meta RL*, section 6.2.
 
     Args:
-        num_tasks: number of tasks, and so of logits.
+        num_tasks: number of tasks and of logits.
         task_latent_dim: size of m.
 
     Example:
@@ -99,7 +100,7 @@ def make_task_classifier(num_tasks: int, task_latent_dim: int = 2) -> TensorDict
 
 
 def prototype(task_latent: Tensor, kind: str = "mean") -> Tensor:
-    """One point that stands for a task.
+    """One point that represents a task.
 
     Args:
         task_latent: embeddings of the task's transitions, ``(N, m)``.
@@ -122,7 +123,7 @@ def prototype(task_latent: Tensor, kind: str = "mean") -> Tensor:
     if kind == "medoid":
         centre = task_latent.median(0).values
         return task_latent[(task_latent - centre).norm(dim=-1).argmin()]
-    raise BMRLError(f"unknown prototype {kind!r}; valid: mean, medoid")
+    raise UnknownNameError("prototype", kind, ("mean", "medoid"))
 
 
 class PrototypeTaskLatent(Transform):
@@ -172,7 +173,7 @@ class PrototypeTaskLatent(Transform):
 
 
 def last_transition(tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDict:
-    """What the encoder reads, of the step that an environment has just taken."""
+    """The transition that an environment has just taken, with the keys that the encoder reads."""
     return TensorDict(
         {
             "observation": tensordict.get("observation"),
@@ -211,12 +212,12 @@ class OnlineTaskLatent(PrototypeTaskLatent):
 
 
 class StageTaskLatent(PrototypeTaskLatent):
-    """Writes the point of the stage at hand: the oracle that knows the task index.
+    """Writes the point of the present stage, as an oracle that knows the task index does.
 
-    Reads ``stage (*B,)``, the number of stages that are done.
+    It reads ``stage (*B,)``, the number of finished stages.
 
     Args:
-        task_latents: a point for each stage, ``(stages, m)``; the last one serves beyond the end.
+        task_latents: a point for each stage, ``(stages, m)``; the last one is kept at the end.
 
     Example:
         >>> transform = StageTaskLatent(torch.tensor([[0.0], [1.0]]))
@@ -238,168 +239,12 @@ class StageTaskLatent(PrototypeTaskLatent):
         return tensordict.set("task_latent", self.task_latents[stage])
 
 
-ALIGNMENTS = ("time", "state", "progress")
-"""How a demonstration's embeddings follow an episode; see :class:`DemonstrationTaskLatent`."""
-
-
-@torch.no_grad()
-def _embed(demonstration: TensorDictBase, encoder: TensorDictModule) -> Tensor:
-    """Embeddings of a demonstration's transitions, ``(T, m)``."""
-    shapes = {}
-    for key in TRANSITION_KEYS:
-        value = demonstration.get(key, None)
-        if value is None:
-            raise BMRLError(f"the demonstration has no {key!r}; valid: {list(TRANSITION_KEYS)}")
-        shapes[key] = tuple(value.shape)
-    try:
-        return encoder(demonstration.select(*TRANSITION_KEYS)).get("task_latent")
-    except RuntimeError as error:
-        raise BMRLError(
-            f"the demonstration's shapes are {shapes}; valid: those that the encoder was trained "
-            f"on ({error})"
-        ) from error
-
-
-class DemonstrationTaskLatent(PrototypeTaskLatent):
-    """Writes the embeddings of one demonstration.
-
-    Where the demonstration has ``stage (T,)``, a composition's number of finished tasks, the
-    episode's own ``stage (*B,)`` is read, and each stage is driven by the demonstration's
-    transitions of that stage (stages that it lacks, by those of its last one).
-
-    Args:
-        demonstration: the demonstration's transitions, batch size ``(T,)``, with the keys of
-            :data:`TRANSITION_KEYS`.
-        encoder: :func:`make_task_encoder`'s module, trained.
-        alignment: ``"time"``: as many transitions into the stage as the episode is steps into it,
-            and the stage's last one beyond its end; ``"state"``: the transition whose observation
-            is nearest; ``"progress"``: the transition whose embedding is nearest to that of the
-            episode's last one, of those that follow the one before within ``window``. Time passes
-            alike for a slowed arm; progress waits for it.
-        window: transitions that progress may advance at a step.
-
-    Raises:
-        BMRLError: for another alignment, a window below one, or a demonstration that is empty,
-            lacks a key, has stages that go back, or sizes that the encoder does not take.
-
-    Example:
-        >>> from torchrl.envs import TransformedEnv
-        >>> from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
-        >>> env = ContinuousActionVecMockEnv()
-        >>> source = DemonstrationTaskLatent(env.rollout(5), make_task_encoder(7, 7))
-        >>> latent = TransformedEnv(env, source).rollout(3)["task_latent"]
-        >>> torch.equal(latent, source.latents[:3])
-        True
-    """
-
-    def __init__(
-        self,
-        demonstration: TensorDictBase,
-        encoder: TensorDictModule,
-        *,
-        alignment: str = "time",
-        window: int = 20,
-    ) -> None:
-        if alignment not in ALIGNMENTS:
-            raise UnknownNameError("alignment", alignment, ALIGNMENTS)
-        if not len(demonstration):
-            raise BMRLError("a demonstration of 0 transitions; valid: at least one")
-        if window < 1:
-            raise BMRLError(f"window is {window}; valid: at least 1")
-        latents = _embed(demonstration, encoder)
-        super().__init__(latents[0])
-        self.alignment = alignment
-        self.window = window
-        self.encoder = encoder
-        self.register_buffer("latents", latents)
-        self.register_buffer("observations", demonstration.get("observation").clone())
-        stages = demonstration.get("stage", None)
-        if stages is None:
-            stages = torch.zeros(len(latents), dtype=torch.int64)
-        if stages.shape != latents.shape[:1] or (stages.diff() < 0).any() or stages[0] < 0:
-            raise BMRLError(
-                f"stage of the demonstration is {stages.tolist()}; valid: a number for each of its "
-                f"{len(latents)} transitions, from 0 on, that never goes back"
-            )
-        # Where each stage begins, and the end.
-        number = torch.arange(int(stages.max()) + 2)
-        self.register_buffer("first", torch.searchsorted(stages.contiguous(), number))
-        self.staged = "stage" in demonstration.keys()  # noqa: SIM118 (a TensorDict)
-        self._stage = self._position = torch.zeros((), dtype=torch.int64)
-
-    def _candidates(self) -> tuple[Tensor, Tensor]:
-        """First and last transition that may drive each episode now."""
-        return self.first[self._stage], self.first[self._stage + 1] - 1
-
-    def _stage_of(self, tensordict: TensorDictBase, otherwise: Tensor) -> Tensor:
-        """The episodes' stages, of those that the demonstration has."""
-        if not self.staged:
-            return otherwise
-        return tensordict.get("stage").clamp(max=len(self.first) - 2)
-
-    def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set("task_latent", self.latents[self._position])
-
-    def _nearest(self, distance: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        """Index of the smallest ``distance (*B, T)`` between ``low`` and ``high (*B,)``."""
-        number = torch.arange(len(self.latents), device=distance.device)
-        outside = (number < low.unsqueeze(-1)) | (number > high.unsqueeze(-1))
-        return distance.masked_fill(outside, torch.inf).argmin(-1)
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        shape, device = tensordict_reset.batch_size, self.latents.device
-        start = torch.zeros(shape, dtype=torch.int64, device=device)
-        reset = None if tensordict is None else tensordict.get("_reset", None)
-        # Of several environments some may restart while others go on.
-        anew = torch.ones_like(start, dtype=torch.bool) if reset is None else reset.reshape(shape)
-        self._stage = torch.where(anew, self._stage_of(tensordict_reset, start), self._stage)
-        low, high = self._candidates()
-        if self.alignment == "state":
-            low = self._nearest(self._state_distance(tensordict_reset), low, high)
-        self._position = torch.where(anew, low, self._position)
-        return self._write(tensordict_reset)
-
-    def _state_distance(self, tensordict: TensorDictBase) -> Tensor:
-        observation = tensordict.get("observation").unsqueeze(-2)
-        return (observation - self.observations).norm(dim=-1)
-
-    @torch.no_grad()
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        stage = self._stage_of(next_tensordict, self._stage)
-        moved = stage != self._stage
-        self._stage = stage
-        low, high = self._candidates()
-        if self.alignment == "time":
-            position = torch.minimum(self._position + 1, high)
-        elif self.alignment == "state":
-            position = self._nearest(self._state_distance(next_tensordict), low, high)
-        else:
-            last = self.encoder(last_transition(tensordict, next_tensordict)).get("task_latent")
-            distance = (last.unsqueeze(-2) - self.latents).norm(dim=-1)
-            ahead = torch.minimum(self._position + self.window, high)
-            position = self._nearest(distance, torch.minimum(self._position, high), ahead)
-        if self.alignment != "state":
-            position = torch.where(moved, low, position)
-        self._position = position
-        return self._write(next_tensordict)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Not defined outside an environment: the alignment needs an episode.
-
-        Raises:
-            BMRLError: always.
-        """
-        raise BMRLError("DemonstrationTaskLatent acts in an environment, not on stored data")
-
-
 class PathTaskLatent(PrototypeTaskLatent):
-    """Writes the points of a path, one a step, and its last one beyond the end.
+    """Writes the points of a path, one for each step, and then keeps the last one.
 
     Args:
-        points: the path of every environment, ``(T, m)``, or of each of a batch, ``(*B, T, m)``;
-            a path of one point is held through the episode.
+        points: one path for all environments, ``(T, m)``, or one for each of a batch,
+            ``(*B, T, m)``; a path of one point is constant.
 
     Raises:
         BMRLError: if there is no point; at a reset, if the batch of paths is not the environment's.
@@ -433,7 +278,7 @@ class PathTaskLatent(PrototypeTaskLatent):
             )
         start = torch.zeros(shape, dtype=torch.int64, device=self.points.device)
         reset = None if tensordict is None else tensordict.get("_reset", None)
-        # Of several environments some may restart while others go on.
+        # Some of several environments may be reset while others continue.
         self._time = start if reset is None else self._time.masked_fill(reset.reshape(shape), 0)
         return self._write(tensordict_reset)
 
