@@ -26,7 +26,7 @@ from torchrl_bmrl.errors import BMRLError, ConfigError
 from torchrl_bmrl.evaluation import bootstrap_interval
 from torchrl_bmrl.files import read_rows, whole, write_rows
 from torchrl_bmrl.modules import DemonstrationTaskLatent, StageTaskLatent
-from torchrl_bmrl.modules.task_latent import ALIGNMENTS
+from torchrl_bmrl.modules.demonstration_latent import ALIGNMENTS
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.reports import Section, Table, write_study
 from torchrl_bmrl.run.folder import open_run
