@@ -31,7 +31,10 @@ class CollectSettings:
         6
     """
 
-    train_episodes: dict[str, int] = setting({"default": 60, "lift": 80}, above=0)  # by task
+    # By task; "default" is for the others.
+    train_episodes: dict[str, int] = setting(
+        {"default": 60, **dict.fromkeys(SIX_TASKS, 60), "lift": 80}, above=0
+    )
     valid_episodes: int = setting(6, above=0)  # of each task, held out
     noise: float = setting(0.2, at_least=0)  # standard deviation on every action dimension
     # By task: what the expert does before an episode begins, in turn. Starts as in a composition.
