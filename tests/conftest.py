@@ -36,7 +36,7 @@ def own_logging() -> Iterator[None]:
 
     def reset() -> None:
         logger.handlers.clear()
-        logger.setLevel(logging.NOTSET)
+        logger.setLevel(logging.WARNING)  # Hydra changes the level of the root logger
 
     reset()
     yield

@@ -42,6 +42,7 @@ from torchrl_bmrl.evaluation.statistics import (
     relative_difference,
 )
 from torchrl_bmrl.functional import mean_and_scale
+from torchrl_bmrl.tasks import get_task
 
 RNG = np.random.default_rng(0)
 
@@ -154,12 +155,13 @@ def task_data(value: float, rows: int = 6) -> TensorDict:
 
 @pytest.mark.parametrize("rows", [1, 6])
 def test_observations_that_never_change_have_the_scale_one(rows: int) -> None:
-    same = ObservationStatistics.of([task_data(0.3, rows), task_data(0.3, rows)])
+    tasks = [get_task("reach"), get_task("lift")]
+    same = ObservationStatistics.of([task_data(0.3, rows), task_data(0.3, rows)], tasks)
     assert same.scale.tolist() == [1.0] * 33
     # Constant in each task, and not over both.
-    apart = ObservationStatistics.of([task_data(0.3, rows), task_data(0.5, rows)])
+    apart = ObservationStatistics.of([task_data(0.3, rows), task_data(0.5, rows)], tasks)
     torch.testing.assert_close(apart.scale[-3:], torch.full((3,), 0.1))
-    little = ObservationStatistics.of([task_data(0.3, rows), task_data(0.3 + 1e-5, rows)])
+    little = ObservationStatistics.of([task_data(0.3, rows), task_data(0.3 + 1e-5, rows)], tasks)
     torch.testing.assert_close(little.scale[-3:], torch.full((3,), 1e-3))
 
 
@@ -177,10 +179,11 @@ def test_statistics_of_constant_demonstrations_can_be_read_back(tmp_path: Path) 
     parts = {name: np.full((5, *shape), 0.1) for name, (shape, _) in TASK_PARTS.items()}
     episode = replace(make_episode(), observations=parts, next_observations=parts)
     write_episodes(tmp_path / "lift.hdf5", [episode], env_args={}, masks={"train": [0]})
-    write_statistics(tmp_path, ["lift"])
-    for statistics in (read_statistics(tmp_path), read_statistics(tmp_path, "lift")):
+    lift = get_task("lift")
+    write_statistics(tmp_path, [lift])
+    for statistics in (read_statistics(tmp_path), read_statistics(tmp_path, lift)):
         assert statistics.scale.tolist() == [1.0] * 33
-        data = load_transitions(tmp_path, "lift", statistics, split="train", num_task=1)
+        data = load_transitions(tmp_path, lift, statistics, split="train", index=1)
         assert data["observation"].abs().max() < 1e-6
 
 
@@ -192,13 +195,12 @@ def test_a_loss_refuses_numbers_that_it_cannot_normalise_with(name: str, value: 
 
 
 @pytest.mark.parametrize("values", [[2.0], [0.0, 0.0], [0.1, 0.1, 0.1]])
-def test_the_student_s_recipe_divides_by_one_where_rewards_are_all_the_same(
-    values: list[float], monkeypatch: pytest.MonkeyPatch
+def test_stage_2_divides_by_one_where_rewards_are_all_the_same(
+    values: list[float],
 ) -> None:
-    for package in ("hydra", "h5py", "gymnasium", "safetensors", "tqdm"):
+    for package in ("h5py", "gymnasium", "safetensors", "tqdm"):
         pytest.importorskip(package)
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "recipes"))
-    from distill import spread
+    from torchrl_bmrl.pipeline.stage2 import spread
 
     assert spread(torch.tensor(values).unsqueeze(-1)).item() == 1.0
     varied = torch.tensor([[1.0], [3.0]])

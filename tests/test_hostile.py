@@ -32,7 +32,7 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from safetensors.torch import load, save
-from small_runs import configured
+from small_runs import configured, settings_of
 
 from torchrl_bmrl.data.demonstrations import read_statistics
 from torchrl_bmrl.data.episodes import Episode
@@ -40,6 +40,7 @@ from torchrl_bmrl.data.robomimic import keep_episode, read_kept_episode
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
 from torchrl_bmrl.modules import BCQPolicy
+from torchrl_bmrl.pipeline import Run, learners
 from torchrl_bmrl.pipeline.agents import (
     Student,
     load_bcq_loss,
@@ -47,7 +48,9 @@ from torchrl_bmrl.pipeline.agents import (
     make_bcq_loss,
     make_distillation_loss,
 )
+from torchrl_bmrl.pipeline.stage2 import OF_THE_STUDENT, loss_options
 from torchrl_bmrl.run.folder import deciding, open_run, read_settings, read_versions
+from torchrl_bmrl.tasks import Task, get_task
 from torchrl_bmrl.training import checkpoint, make_adam
 
 TRIED = settings(
@@ -254,11 +257,11 @@ STATISTICS = {"loc": [0.0, 1.0], "scale": [1.0, 2.0]}
 STATISTICS = {**STATISTICS, "tasks": {"reach": STATISTICS}}
 
 
-@pytest.mark.parametrize("task", [None, "reach"])
+@pytest.mark.parametrize("task", [None, get_task("reach")])
 @TRIED
 @given(data=st.data())
 def test_changed_statistics_are_refused_or_fit_to_normalise(
-    tmp_path: Path, task: str | None, data: st.DataObject
+    tmp_path: Path, task: Task | None, data: st.DataObject
 ) -> None:
     text = json.dumps(changed(data, STATISTICS)).encode()
     if data.draw(st.booleans()):
@@ -359,33 +362,27 @@ def setting_names() -> list[str]:
 def test_any_setting_is_refused_by_name_or_makes_losses(
     tmp_path: Path, data: st.DataObject
 ) -> None:
-    from bcq_agents import LOSS_SETTINGS
-    from distill import LOSS_SETTINGS as DISTILLATION
-    from settings import check_settings
-
     key, value = data.draw(st.sampled_from(setting_names())), data.draw(VALUES)
     small = ["bcq.num_cells=[4]", "distill.num_cells=[4]", "preset=smoke", f"run_dir={tmp_path}"]
     try:
-        config = OmegaConf.to_object(configured(*small, f"{key}={value}"))
-        check_settings(config)
+        config = settings_of(*small, f"{key}={value}")
+        config.check()
+        run = Run(config)
     except (BMRLError, HydraException, OmegaConfBaseException):
         return
-    sizes = (*config.bcq.num_cells, *config.distill.num_cells, config.distill.task_latent_dim)
-    if max(*sizes, config.bcq.num_qvalue_nets) > 1000:
+    widths = (*config.bcq.num_cells, *config.distill.num_cells, config.distill.task_latent_dim)
+    if max(*widths, config.bcq.num_qvalue_nets) > 1000:
         return  # memory, not validity
-    agents = [
-        make_bcq_loss(**{name: getattr(config.bcq, name) for name in LOSS_SETTINGS})
-        for _ in config.tasks
-    ]
+    sizes = {"observation_dim": 3, "action_dim": 2}
+    agents = [make_bcq_loss(**learners.loss_options(config.bcq), **sizes) for _ in run.tasks]
     student = Student(
-        num_tasks=len(config.tasks),
-        task_encoder=config.distill.task_encoder,
-        task_latent_dim=config.distill.task_latent_dim,
-        num_cells=config.distill.num_cells,
+        num_tasks=len(run.tasks),
+        **{name: getattr(config.distill, name) for name in OF_THE_STUDENT},
         latent_dim=agents[0].generator.latent_dim,
+        **sizes,
     )
     make_distillation_loss(
         student,
         [BCQPolicy.frozen(agent) for agent in agents],
-        **{name: getattr(config.distill, name) for name in DISTILLATION},
+        **loss_options(config.distill),
     )

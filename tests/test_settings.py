@@ -57,6 +57,7 @@ class Outer:
         ("counts", {"reach": 1, "lift": 0}, "counts.lift is 0; valid: above 0"),
         ("choices", [], "choices is []; valid: at least one value, each once"),
         ("choices", ["a", "a"], "choices is ['a', 'a']; valid: at least one value, each once"),
+        ("choices", [["a"], ["a"]], "valid: at least one value, each once"),
         ("inner", Inner(rate=0.0), "inner.rate is 0.0; valid: above 0 and at most 1"),
     ],
 )

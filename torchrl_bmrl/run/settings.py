@@ -79,7 +79,7 @@ def check_settings(settings: Any, prefix: str = "") -> None:
 
 
 def _check(name: str, value: Any, valid: Mapping[str, Any]) -> None:
-    if valid["unique"] and (not value or len(set(value)) < len(value)):
+    if valid["unique"] and (not value or any(x in value[:i] for i, x in enumerate(value))):
         raise ConfigError(f"{name} is {value}; valid: at least one value, each once")
     for key, item in _items(name, value):
         if valid["choices"] and item not in valid["choices"]:
