@@ -20,20 +20,11 @@ pytest.importorskip("scipy")
 pytest.importorskip("sklearn")
 pytest.importorskip("tqdm")
 
-from small_runs import HORIZON, SMALL, TASKS, configured, contents, times
+import small_runs
+from small_runs import HORIZON, SMALL, configured, contents, times
 
 from torchrl_bmrl.errors import BMRLError, ConfigError
-from torchrl_bmrl.pipeline import (
-    BCQSettings,
-    CollectSettings,
-    DistillSettings,
-    EvaluateSettings,
-    Run,
-    Settings,
-    collect,
-    stage1,
-    stage2,
-)
+from torchrl_bmrl.pipeline import Run, collect, stage1, stage2
 from torchrl_bmrl.run.settings import check_settings
 from torchrl_bmrl.studies import imitation, interpolation, interpolation_report
 from torchrl_bmrl.studies.imitation import ImitateSettings, imitate
@@ -46,21 +37,12 @@ from torchrl_bmrl.studies.latent_sac import (
     train_job,
 )
 
+pytestmark = pytest.mark.usefixtures("recipes")  # which know the settings by name
+
 
 def make_run(folder: Path) -> Run:
-    return Run(
-        Settings(
-            run_dir=str(folder),
-            workers=1,
-            tasks=TASKS,
-            collect=CollectSettings(train_episodes={"default": 1}, valid_episodes=2),
-            bcq=BCQSettings(epochs=1, updates_per_epoch=6, batch_size=8, num_cells=[16, 16]),
-            distill=DistillSettings(
-                updates=12, batch_size=8, num_cells=[16, 16], task_latent_dim=3
-            ),
-            evaluate=EvaluateSettings(num_candidates=5),
-        )
-    )
+    overrides = ("workers=1", "collect.valid_episodes=2", "distill.task_latent_dim=3")
+    return small_runs.make_run(folder, *overrides)
 
 
 def study(folder: Path, function: Any, settings: Any) -> str:
@@ -74,7 +56,7 @@ def read(path: Path) -> list[dict[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def distilled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def distilled(recipes: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder with demonstrations and both stages."""
     pytest.importorskip("robosuite", exc_type=ImportError)
     folder = tmp_path_factory.mktemp("distilled")
