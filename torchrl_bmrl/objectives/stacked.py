@@ -148,20 +148,7 @@ class StackedLoss(LossModule):
         "deterministic_sampling_mode", "Exploration type under which the members run."
     )
 
-    @property
-    def value_estimator(self) -> Any:
-        """The members' estimator."""
-        return self._template.value_estimator
-
-    @property
-    def _value_estimator(self) -> Any:
-        template = self.__dict__.get("_template")
-        return None if template is None else template._value_estimator
-
-    @_value_estimator.setter
-    def _value_estimator(self, value: Any) -> None:
-        if "_template" in self.__dict__:
-            self._template._value_estimator = value
+    _value_estimator = _of_members("_value_estimator", "The members' value estimator.")
 
     def set_keys(self, **kwargs: Any) -> None:
         """Renames entries for all members.
