@@ -41,7 +41,8 @@ def _of_members(name: str, doc: str) -> Any:
         for loss in self._all() if "_template" in self.__dict__ else ():
             setattr(loss, name, value)
 
-    return property(read, write, doc=doc)
+    read.__doc__ = doc
+    return property(read, write)
 
 
 class StackedLoss(LossModule):
