@@ -57,6 +57,7 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
     Example:
         >>> from torchrl.envs import TransformedEnv
         >>> from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
+        >>> from torchrl_bmrl.modules import make_task_encoder
         >>> env = ContinuousActionVecMockEnv()
         >>> source = DemonstrationTaskLatent(env.rollout(5), make_task_encoder(7, 7))
         >>> latent = TransformedEnv(env, source).rollout(3)["task_latent"]

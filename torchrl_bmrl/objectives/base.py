@@ -213,7 +213,7 @@ class KeyedLoss(LossModule):
         """Keys that ``forward`` returns, in order."""
         raise NotImplementedError(
             f"{type(self).__name__} has no written_keys(); valid: a method that returns the keys "
-            "that forward() returns, in its order, such as ['loss_qvalue', 'td_error']"
+            "that forward() returns, in its order; of an OfflineLoss 'terms' such as ('qvalue',)"
         )
 
     @property

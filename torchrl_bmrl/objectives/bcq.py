@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, dispatch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_bmrl.errors import BMRLError
@@ -71,6 +71,7 @@ class BCQLoss(GenerativeLoss):
             outside the bounds.
 
     Example:
+        >>> from tensordict import TensorDict
         >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
         >>> generator = ActionVAE(observation_dim=3, action_dim=2)
         >>> critics = [make_qvalue_network(observation_dim=3, action_dim=2) for _ in range(2)]
@@ -106,17 +107,11 @@ class BCQLoss(GenerativeLoss):
         self.convert_critics(qvalue_network, num_qvalue_nets)
         self.finish()
 
-    def written_keys(self) -> list[str]:
-        """Losses in update order, then metrics."""
-        return [
-            "loss_generator",
-            "loss_qvalue",
-            *(["loss_perturbation"] if self.perturbation_network is not None else []),
-            *self.generator_metrics,
-            "pred_value",
-            "target_value",
-            "next_state_value",
-        ]
+    @property
+    def terms(self) -> list[str]:
+        """Names of the losses, in update order."""
+        perturbed = self.perturbation_network is not None
+        return ["generator", "qvalue", *(["perturbation"] if perturbed else [])]
 
     # -- losses, in update order; the base has generator_loss ------------------------------------
 
@@ -153,14 +148,3 @@ class BCQLoss(GenerativeLoss):
         proposal = self.perturb(proposal)
         value = self.qvalue(proposal, frozen=True)[0]
         return self.reduce(-value, tensordict), {}
-
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Computes every loss with the present parameters; the class lists the keys."""
-        loss_generator, generator_info = self.generator_loss(tensordict)
-        loss_qvalue, qvalue_info = self.qvalue_loss(tensordict)
-        tensordict.set(self.tensor_keys.priority, qvalue_info.pop("td_error").amax(0))
-        losses = {"loss_generator": loss_generator, "loss_qvalue": loss_qvalue}
-        if self.perturbation_network is not None:
-            losses["loss_perturbation"], _ = self.perturbation_loss(tensordict)
-        return TensorDict(losses | generator_info | qvalue_info)

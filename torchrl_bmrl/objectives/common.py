@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
 import torch
-from tensordict import TensorDictBase, TensorDictParams
-from tensordict.nn import TensorDictModule
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
@@ -23,11 +23,7 @@ from torchrl_bmrl.objectives.checks import check_network, check_number
 from torchrl_bmrl.objectives.data import missing, next_key, select
 from torchrl_bmrl.objectives.ensemble import Ensemble, can_stack, copies
 from torchrl_bmrl.objectives.estimators import make_estimator, outcomes
-from torchrl_bmrl.objectives.sizes import (
-    parts_of,
-    shapes_of,
-    warm_up,
-)
+from torchrl_bmrl.objectives.sizes import parts_of, shapes_of, warm_up
 from torchrl_bmrl.objectives.swap import holding, read, shared_keys, unbound
 from torchrl_bmrl.ownership import note_copied
 
@@ -40,8 +36,9 @@ class OfflineLoss(KeyedLoss):
     """Base of losses that learn one critic, or an ensemble of critics, from a fixed batch.
 
     It provides the critics (:meth:`convert_critics`, :meth:`qvalue`), the value estimators
-    (:meth:`temporal_difference`), and checked access to the data (:meth:`rows`). A subclass
-    declares its keys, converts its networks, and defines one method per loss and a ``forward``.
+    (:meth:`temporal_difference`), and checked access to the data (:meth:`rows`). A subclass names
+    its losses in ``terms``, in update order: the term ``"actor"`` is computed by the method
+    ``actor_loss``, which returns it with a dict of metrics, and returned as ``loss_actor``.
 
     Keyword Args:
         gamma: discount of the default TD(0) estimator.
@@ -55,7 +52,6 @@ class OfflineLoss(KeyedLoss):
         BMRLError: for ``gamma`` outside [0, 1].
 
     Example:
-        >>> from tensordict import TensorDict
         >>> from torchrl_bmrl.modules import make_qvalue_network
         >>> loss = OfflineLoss(gamma=0.9)  # as in a subclass
         >>> loss.convert_critics(make_qvalue_network(3, 2), num_qvalue_nets=2)
@@ -76,6 +72,8 @@ class OfflineLoss(KeyedLoss):
         priority: NestedKey = "td_error"  # written to the input
         priority_weight: NestedKey = "priority_weight"  # read from the input where present
 
+    terms: Any = ()
+    metrics: Any = ("pred_value", "target_value", "next_state_value")
     tensor_keys: Any
     default_keys: Any = _AcceptedKeys
     default_value_estimator = ValueEstimators.TD0
@@ -127,15 +125,14 @@ class OfflineLoss(KeyedLoss):
                 initialised anew.
         """
         several = isinstance(qvalue_network, (Sequence, nn.ModuleList))
-        given: list[Any] = list(qvalue_network) if several else [qvalue_network]
-        for critic in given:
+        critics: list[Any] = list(qvalue_network) if several else [qvalue_network]
+        for critic in critics:
             check_network("a critic" if several else "qvalue_network", critic)
             self.check_sizes("qvalue_network", critic)
-        critics = given
         if not several:
             count = default if num_qvalue_nets is None else num_qvalue_nets
             count = check_number("num_qvalue_nets", count, 1, integer=True)
-            critics = copies(given[0], count, list(self.parameters()))
+            critics = copies(critics[0], count, list(self.parameters()))
         elif not critics or num_qvalue_nets not in (None, len(critics)):
             raise BMRLError(
                 f"qvalue_network is a list of {len(critics)} critics and num_qvalue_nets is "
@@ -146,14 +143,11 @@ class OfflineLoss(KeyedLoss):
             isinstance(part, _BatchNorm) for critic in critics for part in critic.modules()
         )
         self._stacked = can_stack(critics, self.parameters())
-        if self._stacked:
-            for critic in critics:
-                note_copied(critic, type(self).__name__)
+        for critic in critics if self._stacked else ():
+            note_copied(critic, type(self).__name__)
+        network, size = (critics, len(critics)) if self._stacked else (Ensemble(critics), None)
         self.convert_to_functional(
-            critics if self._stacked else Ensemble(critics),
-            "qvalue_network",
-            expand_dim=len(critics) if self._stacked else None,
-            create_target_params=True,
+            network, "qvalue_network", expand_dim=size, create_target_params=True
         )
 
     def finish(self) -> None:
@@ -170,12 +164,27 @@ class OfflineLoss(KeyedLoss):
         """Gives lazy networks their parameters, by the sizes of the first batch."""
         self._cold = False
         shapes = shapes_of(tensordict, self.in_keys, len(batch))
-        latent = getattr(vars(self).get("generator"), "latent_dim", None)
-        if latent is not None:
+        if (latent := getattr(vars(self).get("generator"), "latent_dim", None)) is not None:
             shapes[getattr(self.tensor_keys, "action_latent", "action_latent")] = (latent,)
         for name, network in vars(self).items():
             for part in parts_of(network) if isinstance(network, nn.Module) else ():
                 warm_up(name, part, shapes)
+
+    def written_keys(self) -> list[str]:
+        """The terms in update order, then the metrics."""
+        terms = [f"loss_{term}" for term in self.terms]
+        return [*terms, *self.metrics] if terms else super().written_keys()
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Computes every term with the present parameters, and writes the priority to the input."""
+        losses: dict[str, Tensor] = {}
+        metrics: dict[str, Tensor] = {}
+        for term in self.terms:
+            losses[f"loss_{term}"], own = getattr(self, f"{term}_loss")(tensordict)
+            metrics |= own
+        tensordict.set(self.tensor_keys.priority, metrics.pop("td_error").amax(0))
+        return TensorDict(losses | metrics)
 
     # -- critics ---------------------------------------------------------------------------------
 
@@ -198,16 +207,13 @@ class OfflineLoss(KeyedLoss):
         target: bool = False,
         frozen: bool = False,
     ) -> Tensor:
-        """One output of all critics, stacked along a new first dimension.
+        """One output of all critics, ``(num_qvalue_nets, *B, n)``.
 
         Args:
             tensordict: what they read, batch ``[*B]``.
             key: the output.
             target: whether with the targets' parameters.
             frozen: whether without a gradient into their parameters.
-
-        Returns:
-            ``(num_qvalue_nets, *B, n)``.
 
         Raises:
             BMRLError: if the data do not fit the critics, or these do not write the key.
@@ -267,8 +273,7 @@ class OfflineLoss(KeyedLoss):
         return [next_key(key) for key in (keys.reward, keys.done, keys.terminated)]
 
     def _estimator_keys(self) -> dict[str, NestedKey]:
-        names = ("reward", "done", "terminated")
-        own = {name: getattr(self.tensor_keys, name) for name in names}
+        own = {name: getattr(self.tensor_keys, name) for name in ("reward", "done", "terminated")}
         return {"value": self.tensor_keys.state_action_value, **own}
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import TensorDictModule, dispatch
+from tensordict import TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data.tensor_specs import Categorical, OneHot, TensorSpec
@@ -74,6 +74,7 @@ class DiscreteBCQLoss(OfflineLoss):
             shapes or, on CPU and not compiled, numbers that are not finite.
 
     Example:
+        >>> from tensordict import TensorDict
         >>> from torchrl.modules import MLP
         >>> def network(name):
         ...     return TensorDictModule(MLP(4, 2), in_keys=["observation"], out_keys=[name])
@@ -98,6 +99,8 @@ class DiscreteBCQLoss(OfflineLoss):
         action_value: NestedKey = "action_value"  # the critics' output
         state_action_value: NestedKey = "chosen_action_value"  # the value of the next action
 
+    terms = ("generator", "qvalue")
+    metrics = ("cross_entropy", *OfflineLoss.metrics)
     default_keys = _AcceptedKeys
     _schedulable_buffers = frozenset({"threshold", "logits_weight"})
 
@@ -140,17 +143,6 @@ class DiscreteBCQLoss(OfflineLoss):
     def observation_keys(self) -> list[NestedKey]:
         """What the networks read of a state."""
         return list(dict.fromkeys([*self.generator.in_keys, *self.qvalue_network.in_keys]))
-
-    def written_keys(self) -> list[str]:
-        """Losses in update order, then metrics."""
-        return [
-            "loss_generator",
-            "loss_qvalue",
-            "cross_entropy",
-            "pred_value",
-            "target_value",
-            "next_state_value",
-        ]
 
     # -- actions and values ----------------------------------------------------------------------
 
@@ -267,15 +259,6 @@ class DiscreteBCQLoss(OfflineLoss):
         index = self.action_index(tensordict, value.shape[-1]).expand(value.shape[:-1])
         predicted = value.gather(-1, index.unsqueeze(-1)).squeeze(-1)
         return self.temporal_difference(tensordict, predicted, next_value)
-
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Computes both losses with the present parameters; the class lists the keys."""
-        loss_generator, generator_info = self.generator_loss(tensordict)
-        loss_qvalue, qvalue_info = self.qvalue_loss(tensordict)
-        tensordict.set(self.tensor_keys.priority, qvalue_info.pop("td_error").amax(0))
-        losses = {"loss_generator": loss_generator, "loss_qvalue": loss_qvalue}
-        return TensorDict(losses | generator_info | qvalue_info)
 
 
 def action_space_of(

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs.utils import set_exploration_type
@@ -82,6 +82,8 @@ class FQELoss(OfflineLoss):
         torch.Size([])
     """
 
+    terms = ("qvalue",)
+
     policy: TensorDictModuleBase
     policy_params: TensorDictParams
 
@@ -117,10 +119,6 @@ class FQELoss(OfflineLoss):
         now = [*self.qvalue_network.in_keys, self.tensor_keys.action]
         return [*now, *map(next_key, self.observation_keys), *self.outcome_keys]
 
-    def written_keys(self) -> list[str]:
-        """The loss, then metrics."""
-        return ["loss_qvalue", "pred_value", "target_value", "next_state_value"]
-
     def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of the critics, summed over them; only the critics receive gradients.
 
@@ -133,13 +131,6 @@ class FQELoss(OfflineLoss):
             next_value = self.state_value(after, target=True)
         data = self.rows(tensordict, self.qvalue_network.in_keys)
         return self.temporal_difference(tensordict, self.qvalue(data), next_value)
-
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Computes the loss with the present parameters; the class lists the keys."""
-        loss_qvalue, info = self.qvalue_loss(tensordict)
-        tensordict.set(self.tensor_keys.priority, info.pop("td_error").amax(0))
-        return TensorDict({"loss_qvalue": loss_qvalue} | info)
 
     # -- value of the policy ---------------------------------------------------------------------
 

@@ -169,9 +169,9 @@ class GenerativeLoss(OfflineLoss):
         return getattr(self.generator, "encoder", self.generator).in_keys
 
     @property
-    def generator_metrics(self) -> list[str]:
-        """Names of the metrics of :meth:`generator_loss`, for ``written_keys``."""
-        return list(self.generator.metrics)
+    def metrics(self) -> list[str]:
+        """Names of the metrics: the generator's, then the critics'."""
+        return [*self.generator.metrics, *OfflineLoss.metrics]
 
     # -- proposed actions ------------------------------------------------------------------------
 

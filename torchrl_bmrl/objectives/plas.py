@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import TensorDictModule, dispatch
+from tensordict import TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_bmrl.errors import BMRLError
@@ -63,6 +63,7 @@ class PLASLoss(GenerativeLoss):
         BMRLError: as :class:`~torchrl_bmrl.objectives.BCQLoss`.
 
     Example:
+        >>> from tensordict import TensorDict
         >>> from torchrl_bmrl.modules import ActionVAE, make_latent_actor, make_qvalue_network
         >>> generator = ActionVAE(observation_dim=3, action_dim=2)
         >>> actor = make_latent_actor(observation_dim=3, latent_dim=generator.latent_dim)
@@ -76,6 +77,7 @@ class PLASLoss(GenerativeLoss):
         >>> (losses["loss_qvalue"] + losses["loss_actor"]).backward()
     """
 
+    terms = ("generator", "qvalue", "actor")
     fixed_options = ("latent_clip",)
     state_networks = ("actor_network", "qvalue_network", "perturbation_network")
 
@@ -109,18 +111,6 @@ class PLASLoss(GenerativeLoss):
         self.convert_to_functional(actor_network, "actor_network", create_target_params=True)
         self.convert_critics(qvalue_network, num_qvalue_nets)
         self.finish()
-
-    def written_keys(self) -> list[str]:
-        """Losses in update order, then metrics."""
-        return [
-            "loss_generator",
-            "loss_qvalue",
-            "loss_actor",
-            *self.generator_metrics,
-            "pred_value",
-            "target_value",
-            "next_state_value",
-        ]
 
     # -- losses, in update order; the base has generator_loss ------------------------------------
 
@@ -160,17 +150,3 @@ class PLASLoss(GenerativeLoss):
         acted = self.act(self.rows(tensordict, self.observation_keys))
         value = self.qvalue(acted, frozen=True)[0]
         return self.reduce(-value, tensordict), {}
-
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Computes every loss with the present parameters; the class lists the keys."""
-        loss_generator, generator_info = self.generator_loss(tensordict)
-        loss_qvalue, qvalue_info = self.qvalue_loss(tensordict)
-        tensordict.set(self.tensor_keys.priority, qvalue_info.pop("td_error").amax(0))
-        loss_actor, _ = self.actor_loss(tensordict)
-        losses = {
-            "loss_generator": loss_generator,
-            "loss_qvalue": loss_qvalue,
-            "loss_actor": loss_actor,
-        }
-        return TensorDict(losses | generator_info | qvalue_info)

@@ -41,7 +41,8 @@ def _of_members(name: str, doc: str) -> Any:
         for loss in self._all() if "_template" in self.__dict__ else ():
             setattr(loss, name, value)
 
-    return property(read, write, doc=doc)
+    read.__doc__ = doc
+    return property(read, write)
 
 
 class StackedLoss(LossModule):
@@ -148,20 +149,7 @@ class StackedLoss(LossModule):
         "deterministic_sampling_mode", "Exploration type under which the members run."
     )
 
-    @property
-    def value_estimator(self) -> Any:
-        """The members' estimator."""
-        return self._template.value_estimator
-
-    @property
-    def _value_estimator(self) -> Any:
-        template = self.__dict__.get("_template")
-        return None if template is None else template._value_estimator
-
-    @_value_estimator.setter
-    def _value_estimator(self, value: Any) -> None:
-        if "_template" in self.__dict__:
-            self._template._value_estimator = value
+    _value_estimator = _of_members("_value_estimator", "The members' value estimator.")
 
     def set_keys(self, **kwargs: Any) -> None:
         """Renames entries for all members.

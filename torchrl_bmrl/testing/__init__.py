@@ -1,4 +1,4 @@
-"""The contract of a loss, for your own tests; it needs pytest (the extra ``[test]``).
+"""Tests that every loss must pass, for your own losses; they need pytest (extra ``[test]``).
 
 The core does not import this package.
 """
@@ -8,7 +8,7 @@ from torchrl_bmrl.extras import needs
 with needs("test"):
     import pytest
 
-# Before they are imported: a failed check shows the values that it compared.
+# Before the import, so that a failed check shows the compared values.
 pytest.register_assert_rewrite(f"{__name__}.contract", f"{__name__}.measures")
 
 from torchrl_bmrl.testing.case import Case, discrete_transitions, transitions  # noqa: E402

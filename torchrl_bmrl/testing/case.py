@@ -1,4 +1,4 @@
-"""What the contract needs to know about a loss, and data to run it on."""
+"""Description of a loss for the contract, and data to run it on."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def transitions(
     dtype: torch.dtype = torch.float64,
     seed: int = 0,
 ) -> TensorDict:
-    """Random transitions; the first row of every batch is terminated, the second truncated.
+    """Random transitions; the first row is terminated, the second truncated.
 
     Args:
         *batch: shape of the batch.
@@ -71,7 +71,7 @@ def discrete_transitions(
     Args:
         *batch: shape of the batch.
         observation_dim: size of ``observation``.
-        num_actions: number of actions to choose from.
+        num_actions: number of actions.
         action_space: ``"one-hot"`` for actions ``(*B, num_actions)``, ``"categorical"`` for
             ``(*B,)``.
         dtype: of observation and reward.
@@ -89,32 +89,32 @@ def discrete_transitions(
 
 
 def unchanged(name: str, network: TensorDictModuleBase) -> TensorDictModuleBase:
-    """The edit that leaves every network as it is."""
+    """The edit that changes no network."""
     return network
 
 
 @dataclass(frozen=True)
 class Case:
-    """A loss, how to build it, and what it claims.
+    """A loss, how to build it, and its properties.
 
-    The contract builds the loss again and again, as
-    ``loss(**networks(), **options, reduction="none")`` and the like: with networks of another type
-    or with a common torso, with one critic or several, and with other options.
+    The contract builds the loss many times, as in
+    ``loss(**networks(), **options, reduction="none")``: with networks of another dtype or with a
+    shared torso, with one critic or several, and with other options.
 
     Attributes:
         loss: class of the loss, or a function that builds it. It takes the networks by the names
             that ``networks`` gives them, and passes options on to its base.
         networks: makes new, small networks by the names of the loss's arguments; one critic under
             ``"qvalue_network"``, of which the contract makes as many as it needs.
-        trains: by term, in update order, the networks that its gradient reaches: the term
+        trains: by term, in update order, the networks that its gradient reaches. The term
             ``"actor"`` is returned as ``loss_actor`` and computed by the method ``actor_loss``.
         targets: networks that have a target network.
-        options: further arguments that the loss always gets.
+        options: further arguments of the loss.
         data: makes a batch from its shape, ``data(*shape, dtype=...)``.
         shape: shape of a batch.
-        need_not_fall: terms that training may raise, as those that follow another network.
-        mixes_rows: whether a row's losses depend on other rows of its batch, as with a context that
-            is drawn from the batch.
+        need_not_fall: terms that training may increase, because they follow another network.
+        mixes_rows: whether a row's losses depend on other rows of its batch, for example by a
+            context that is drawn from the batch.
 
     Example:
         >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
@@ -174,10 +174,10 @@ class Case:
 
         Args:
             num_critics: number of critics.
-            critics: critics to use as they are, instead of new ones.
+            critics: critics to use unchanged, instead of new ones.
             dtype: of the networks' parameters.
             seed: of the networks' parameters.
-            edit: what every network passes through, with its name, before the loss takes it.
+            edit: called with the name and each network; returns the network for the loss.
             **options: further arguments of the loss.
         """
         torch.manual_seed(seed)
@@ -203,15 +203,15 @@ class Case:
 
 
 def _edited(value: Any, dtype: torch.dtype, edit: Callable[..., Any]) -> Any:
-    """A network, or all of several, of another type and edited."""
+    """A network, or a list of networks, with another dtype and edited."""
     if isinstance(value, (list, tuple)):
         return [_edited(each, dtype, edit) for each in value]
     if not isinstance(value, nn.Module):
         return value
     value = value.to(dtype)
     if hasattr(value, "row_loss") and not hasattr(value, "encoder"):
-        return value  # a generator is no network with keys: it is used as it is
+        return value  # a generator without parts has no keys to edit
     parts = [name for name in ("encoder", "decoder") if hasattr(value, name)]
-    for name in parts:  # a generator is used by its parts
+    for name in parts:  # a loss uses the parts of a generator
         setattr(value, name, edit(getattr(value, name)))
     return edit(value) if isinstance(value, TensorDictModuleBase) and not parts else value

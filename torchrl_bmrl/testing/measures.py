@@ -1,4 +1,4 @@
-"""What a loss returns, what its gradients reach, and what it is made of."""
+"""Measurements of a loss: its values, its gradients, and its state."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from torchrl_bmrl.errors import BMRLError
 
 
 def run(loss: LossModule, data: TensorDict, seed: int = 0) -> TensorDict:
-    """The losses for one fixed draw of everything that is random."""
+    """The losses for one seed of the random numbers."""
     torch.manual_seed(seed)
     return loss(data)
 
 
 def by_method(loss: Any, term: str, data: TensorDict, seed: int = 0) -> Tensor:
-    """One term from its own method, for a fixed draw."""
+    """One term from its own method, for one seed."""
     torch.manual_seed(seed)
     return getattr(loss, f"{term}_loss")(data)[0]
 
@@ -61,7 +61,7 @@ def state(module: nn.Module) -> dict[str, Tensor]:
 
 
 def gradients(loss: LossModule) -> dict[str, Tensor]:
-    """Gradient of every parameter, zero for those that have none."""
+    """Gradient of every parameter, zero where there is none."""
     return {
         name: torch.zeros_like(p) if p.grad is None else p.grad.clone()
         for name, p in loss.named_parameters()
@@ -79,7 +79,7 @@ def network_of(name: str) -> str:
 
 
 def reached(loss: LossModule) -> set[str]:
-    """Networks that hold a gradient other than zero."""
+    """Networks with a gradient that is not zero."""
     return {network_of(name) for name, grad in gradients(loss).items() if grad.any()}
 
 
@@ -89,7 +89,7 @@ def all_of(trains: Any) -> set[str]:
 
 
 def refused(loss: LossModule, data: TensorDict, *words: str) -> None:
-    """Fails unless the loss refuses the data, names what is wrong, and has written nothing."""
+    """Fails unless the loss raises an error with the given words and has written nothing."""
     before = dict(data.items(True, True))
     with pytest.raises(BMRLError) as error:
         loss(data)

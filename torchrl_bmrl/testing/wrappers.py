@@ -1,4 +1,4 @@
-"""Networks with other keys, on a common torso, or with dropout, around a loss's own ones."""
+"""Wrappers of a loss's networks: with other keys, on a shared torso, or with dropout."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchrl_bmrl.testing.case import CRITIC, Case
 
 
 def renamed(key: Any, names: Mapping[Any, Any]) -> Any:
-    """A key with its new name; one under ``"next"`` or ``"previous"`` stays there.
+    """A key with its new name; the prefixes ``"next"`` and ``"previous"`` are kept.
 
     Example:
         >>> renamed(("next", "reward"), {"reward": ("my", "reward")})
@@ -47,7 +47,7 @@ class Renamed(TensorDictModuleBase):
 
 
 class OnTorso(TensorDictModuleBase):
-    """A network that reads features of the observation; it has a parameter of its own, too."""
+    """A network that reads a torso's features of the observation, scaled by its own parameter."""
 
     def __init__(self, network: TensorDictModuleBase, torso: nn.Linear, observation: Any) -> None:
         super().__init__()
@@ -81,7 +81,7 @@ class Dropped(TensorDictModuleBase):
 
 
 def with_dropout(name: str, network: TensorDictModuleBase) -> TensorDictModuleBase:
-    """The edit that gives every critic dropout."""
+    """The edit that adds dropout to every critic."""
     return Dropped(network) if name.rstrip("s").endswith(CRITIC) else network
 
 
@@ -92,8 +92,8 @@ def on_torso(
 
     Args:
         case: the case that builds it.
-        sharing: who shares it: ``"all"`` networks, the ``"critics"`` alone, or all but the other
-            critics than the ``"first"``.
+        sharing: the networks that share it: ``"all"``, only the ``"critics"``, or ``"first"``: all
+            except the critics after the first.
         **options: of the loss.
     """
     torch.manual_seed(7)

@@ -1,4 +1,4 @@
-"""The contract that a loss must hold, as test classes."""
+"""The contract of the losses, as test classes."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ class KeyedLossContract(
     StateChecks,
     CompileChecks,
     RefusalChecks,
-    ClaimChecks,  # pytest begins with the last
+    ClaimChecks,  # pytest runs the last one first
 ):
     """What every :class:`~torchrl_bmrl.objectives.KeyedLoss` must do.
 
-    Derive a test class from it for a loss without critics of its own, and else from
+    Derive a test class from it for a loss without critics; for other losses use
     :class:`OfflineLossContract`.
 
     Attributes:
-        case: the loss, and what it claims.
+        case: the loss and its properties.
 
     Example:
         >>> from torchrl_bmrl.objectives import MetaDistillationLoss
@@ -64,13 +64,13 @@ class OfflineLossContract(
 ):
     """What every :class:`~torchrl_bmrl.objectives.OfflineLoss` must do.
 
-    Derive a test class from it and give it a :class:`Case`. pytest then runs some ninety checks:
-    keys, reductions, masks, priorities, gradients, targets, critics, value estimators, state,
-    copies, types, devices, compilation, and what is refused. Those that need a GPU are skipped
-    without one, those of a generator for a loss that has none.
+    Derive a test class from it and give it a :class:`Case`. pytest then runs about ninety checks
+    of keys, reductions, masks, priorities, gradients, targets, critics, value estimators, state,
+    copies, dtypes, devices, compilation, and errors. It skips checks that need a GPU where there is
+    none, and checks of a generator for a loss without one.
 
     Attributes:
-        case: the loss, and what it claims.
+        case: the loss and its properties.
 
     Example:
         >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network

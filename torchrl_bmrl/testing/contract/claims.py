@@ -1,4 +1,4 @@
-"""What a case claims about its loss."""
+"""Checks that the case describes its loss correctly."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class OfflineClaimChecks:
     """Checks of the methods, for losses with critics."""
 
     def test_every_term_has_a_method_and_other_methods_refuse(self, case: Case) -> None:
-        """TorchRL treats every public method that ends in ``loss`` as a term."""
+        """TorchRL treats every public method whose name ends in ``loss`` as a term."""
         loss = case.make()
         methods = {name[:-5] for name in dir(loss) if name.endswith("_loss") and name[0] != "_"}
         missing = sorted(case.trains.keys() - methods)
         assert not missing, f"the loss has no methods {[f'{name}_loss' for name in missing]}"
-        for name in methods - case.trains.keys():  # of a network that this loss was made without
+        for name in methods - case.trains.keys():  # of a network that this loss does not have
             with pytest.raises(BMRLError):
                 getattr(loss, f"{name}_loss")(case.batch())

@@ -1,4 +1,4 @@
-"""torch.compile."""
+"""Checks of torch.compile."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchrl_bmrl.testing.measures import gradients, run, total
 
 
 def check_compiled(case: Case, **options: Any) -> None:
-    """Fails for a graph break, other values or gradients, or a second compilation.
+    """Fails for a graph break, different values or gradients, or a second compilation.
 
     Args:
         case: the loss.
@@ -38,5 +38,5 @@ class CompileChecks:
     """Checks of compilation, for every loss."""
 
     def test_a_compiled_loss_has_no_graph_break_and_the_same_values(self, case: Case) -> None:
-        """Python that depends on the numbers breaks the graph."""
-        check_compiled(case, backend="eager")  # draws as the uncompiled loss does
+        """Python code that depends on the numbers breaks the graph."""
+        check_compiled(case, backend="eager")  # draws the same numbers as the uncompiled loss

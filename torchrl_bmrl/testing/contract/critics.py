@@ -1,4 +1,4 @@
-"""The critics: an ensemble from a list or from a single one."""
+"""Checks of the critics: an ensemble from a list or from a single critic."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class EnsembleChecks:
 
     @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=needs_cuda)])
     def test_a_loop_instead_of_vmap_changes_nothing(self, case: Case, device: str) -> None:
-        """On CPU the critics run in a loop anyway."""
+        """On CPU the critics always run in a loop."""
         results, grads = [], []
         for deactivate_vmap in (False, True):
             loss = case.make(deactivate_vmap=deactivate_vmap).to(device)
@@ -32,7 +32,7 @@ class EnsembleChecks:
 
     @pytest.mark.parametrize("randomness", [None, "different", "same"])
     def test_critics_may_hold_dropout(self, case: Case, randomness: str | None) -> None:
-        """Random layers draw in a loss, under :func:`torch.vmap`, too."""
+        """Random layers draw in a loss, also under :func:`torch.vmap`."""
         loss, plain = case.make(edit=with_dropout), case.make()
         if randomness is not None:
             loss.set_vmap_randomness(randomness)
@@ -48,7 +48,7 @@ class CriticChecks:
     def test_critics_of_a_list_keep_their_initialisations_and_are_trained(
         self, case: Case, number: int
     ) -> None:
-        """``qvalue_network`` may be a list; ``convert_critics`` takes it."""
+        """``qvalue_network`` may be a list; pass it to ``convert_critics``."""
         critics = case.critics(number)
         values = [state(critic) for critic in critics]
         count = len(list(critics[0].parameters()))
@@ -69,7 +69,7 @@ class CriticChecks:
     def test_critics_compute_what_the_given_networks_do(
         self, case: Case, shared: bool, number: int
     ) -> None:
-        """The loss's own parameters, frozen or not, give the values of the networks."""
+        """The loss's parameters, frozen or not, give the values of the given networks."""
         data = case.batch()
         if shared:
             loss, _, networks = on_torso(case, num_critics=number, separate_losses=True)
@@ -88,7 +88,7 @@ class CriticChecks:
                 assert torch.equal(module(data.clone())[key], critic(data.clone())[key])
 
     def test_a_single_critic_is_copied_with_new_initialisations(self, case: Case) -> None:
-        """A critic needs ``reset_parameters`` in its layers for that."""
+        """This needs ``reset_parameters`` in the critic's layers."""
         (critic,) = case.critics(1)
         given = state(critic)
         loss = case.make(critics=critic, num_qvalue_nets=3)
@@ -99,7 +99,7 @@ class CriticChecks:
         assert loss.qvalue_loss(case.batch())[1]["td_error"].shape == (3, *case.shape)
 
     def test_critics_that_cannot_be_taken_are_refused(self, case: Case) -> None:
-        """The loss passes ``qvalue_network`` and ``num_qvalue_nets`` to ``convert_critics``."""
+        """Pass ``qvalue_network`` and ``num_qvalue_nets`` to ``convert_critics``."""
         critics = case.critics(2)
         with pytest.raises(BMRLError, match=r"list of 0 critics.*valid: at least one critic"):
             case.make(critics=[])

@@ -1,4 +1,4 @@
-"""Value estimators: the target that the critics bootstrap from."""
+"""Checks of the value estimators, which compute the critics' target."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def next_values(*shape: int) -> Tensor:
 
 
 def lambda_return(data: TensorDict, value: Tensor, lmbda: float) -> Tensor:
-    """Backward recursion over the last dimension; an episode's end takes the bootstrap alone."""
+    """Backward recursion over the last dimension; the end of an episode uses the bootstrap only."""
     reward, done, terminated = (
         data["next", key].squeeze(-1) for key in ("reward", "done", "terminated")
     )
@@ -50,7 +50,7 @@ class EstimatorChecks:
     def test_target_is_that_of_the_estimator(
         self, case: Case, estimator: ValueEstimators | None, lmbda: float
     ) -> None:
-        """A trajectory lies along the last dimension of the batch."""
+        """The last dimension of the batch is time."""
         data, value = case.batch(3, 5), next_values(3, 5)
         loss = case.make(gamma=GAMMA if estimator is None else 0.5)
         if estimator is not None:
@@ -67,7 +67,7 @@ class EstimatorChecks:
     def test_gamma_follows_the_estimator(
         self, case: Case, estimator: ValueEstimators | None
     ) -> None:
-        """``loss.gamma`` is the discount that the target has."""
+        """``loss.gamma`` is the discount of the target."""
         loss = case.make(gamma=0.5)
         assert float(loss.gamma) == 0.5
         loss.make_value_estimator(estimator, gamma=0.9)
@@ -98,13 +98,13 @@ class EstimatorChecks:
         assert loss.value_estimator.tensor_keys.reward == "score"
 
     def test_n_step_data_bootstrap_with_the_discount_of_their_steps(self, case: Case) -> None:
-        """``steps_to_next_obs`` says after how many steps the next state comes."""
+        """``steps_to_next_obs`` is the number of steps to the next state."""
         data, value = case.batch(), next_values(*case.shape)
         expected = case.make(gamma=GAMMA**3).td_target(data, value)
         data["steps_to_next_obs"] = torch.full((*case.shape, 1), 3)
         torch.testing.assert_close(case.make(gamma=GAMMA).td_target(data, value), expected)
 
     def test_estimators_that_make_no_sense_are_refused(self, case: Case) -> None:
-        """Generalised advantage estimation needs a policy's own data; the valid ones are named."""
+        """Generalised advantage estimation needs on-policy data; the error names valid ones."""
         with pytest.raises(NotImplementedError, match=r"TD0.*TD1.*TDLambda"):
             case.make().make_value_estimator(ValueEstimators.GAE)

@@ -1,4 +1,4 @@
-"""Gradients and targets: which parameters a term trains, and what follows them."""
+"""Checks of gradients and targets: which parameters a term trains."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def by_forward(loss: Any, term: str, data: TensorDict) -> Tensor:
 
 
 def check_gradients(case: Case, through: Callable[[Any, str, TensorDict], Tensor]) -> None:
-    """Fails unless every term reaches all parameters of its networks, and no others."""
+    """Fails unless the gradient of every term reaches exactly the parameters of its networks."""
     loss = case.make()
     for term, networks in case.trains.items():
         loss.zero_grad()
@@ -58,7 +58,7 @@ class GradientChecks:
     """Checks of gradients, for every loss."""
 
     def test_only_losses_require_a_gradient(self, case: Case) -> None:
-        """Trainers sum what is called ``loss_*``; detach the metrics."""
+        """Trainers sum all keys ``loss_*``; detach the metrics."""
         for key, value in case.make()(case.batch()).items():
             assert value.requires_grad == key.startswith("loss_"), key
 
@@ -78,7 +78,7 @@ class OfflineGradientChecks:
     def test_separate_losses_leave_a_shared_torso_to_the_generator(
         self, case: Case, separate: bool
     ) -> None:
-        """Only losses with a generator know the difference."""
+        """It makes a difference only for losses with a generator."""
         if "generator" not in case.trains:
             pytest.skip("this loss has no generator that its networks could share a torso with")
         loss, torso, _ = on_torso(case, separate_losses=separate)
@@ -96,7 +96,7 @@ class OfflineGradientChecks:
     def test_shared_parameters_are_trained_once_for_all(
         self, case: Case, separate: bool, sharing: str
     ) -> None:
-        """An optimizer sees a shared parameter once, and every network follows it."""
+        """An optimizer finds a shared parameter once, and every network uses it."""
         options: dict[str, Any] = {"separate_losses": separate, "sharing": sharing}
         loss, torso, networks = on_torso(case, **options)
         own = {id(p) for each in networks.values() for part in each for p in part.parameters()}
@@ -137,7 +137,7 @@ class OfflineGradientChecks:
             torch.testing.assert_close(after[key], value)
 
     def test_every_target_network_is_used(self, case: Case) -> None:
-        """A target that no loss runs, with ``target=True``, is one too many, or a mistake."""
+        """A target that no loss runs (``target=True``) is unnecessary, or a mistake."""
         for name in case.targets:
             loss = case.make()
             before = run(loss, case.batch())

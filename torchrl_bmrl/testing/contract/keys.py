@@ -1,4 +1,4 @@
-"""Keys: what a loss reads and writes, under which names."""
+"""Checks of the keys that a loss reads and writes."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from torchrl_bmrl.testing.wrappers import Renamed, renamed
 
 
 def new_names(loss: LossModule) -> dict[str, Any]:
-    """A nested name for every key that ``set_keys`` knows, and for what the networks read."""
+    """A nested name for every key of ``set_keys``, and for those that the networks read."""
     read = {key: ("agent", key) for key in loss.in_keys if isinstance(key, str)}
     accepted = {key: ("my", name) for name, key in asdict(loss.default_keys()).items()}
-    # A keyword call nests what it gets with a batch size of its own; the priority does not fit in.
+    # A keyword call nests its inputs with another batch size, which the priority does not have.
     return read | accepted | {loss.tensor_keys.priority: ("buffer", "priority")}
 
 
@@ -29,7 +29,7 @@ class KeyChecks:
     """Checks of keys, for every loss."""
 
     def test_renamed_and_nested_keys_give_the_same_losses(self, case: Case) -> None:
-        """A key written as a plain string in a loss's code shows here."""
+        """This fails for a key that is a plain string in the loss's code."""
         loss = case.make()
         names = new_names(loss)
 
@@ -62,7 +62,7 @@ class KeyChecks:
         for name, default in asdict(loss.default_keys()).items():
             loss.set_keys(**{name: ("my", name)})
             assert getattr(loss.tensor_keys, name) == ("my", name)
-            for key in fresh.in_keys:  # what a network reads keeps the network's name
+            for key in fresh.in_keys:  # a network's key keeps its name
                 assert {key, renamed(key, {default: ("my", name)})} & set(loss.in_keys)
             loss.set_keys(**{name: None})
             assert loss.tensor_keys == fresh.tensor_keys
@@ -82,7 +82,7 @@ class KeyChecks:
         assert loss.in_keys == ["observation", "action"]
 
     def test_only_the_in_keys_are_read_and_all_of_them_are_needed(self, case: Case) -> None:
-        """``read_keys`` has too few if the first assertion fails, too many if a later one does."""
+        """First fails if ``read_keys`` lacks a key, later if it has too many."""
         loss, data = case.make(), case.batch()
         rest = run(loss, data.select(*loss.in_keys))
         assert_same(rest, run(loss, data.clone()), "with the in_keys alone")
@@ -90,7 +90,7 @@ class KeyChecks:
             refused(loss, data.exclude(key), f"no {key!r}")
 
     def test_tensordict_and_keywords_give_the_out_keys_in_order(self, case: Case) -> None:
-        """``written_keys`` is the order of what ``forward`` returns."""
+        """``written_keys`` has the order of the output of ``forward``."""
         loss, data = case.make(), case.batch()
         expected = run(loss, data)
         assert list(expected.keys()) == loss.out_keys, "forward returns others than out_keys"

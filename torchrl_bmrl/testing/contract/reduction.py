@@ -1,4 +1,4 @@
-"""Reduction, masks, priority weights and the priority."""
+"""Checks of reduction, masks, priority weights and the priority."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def weights(data: TensorDict) -> Tensor:
 
 
 def some_rows(data: TensorDict) -> Tensor:
-    """A mask that leaves out every third row."""
+    """A mask that excludes every third row."""
     return torch.arange(data.numel()).view(data.shape) % 3 > 0
 
 
 def padded(data: TensorDict, mask: Tensor, value: float) -> TensorDict:
-    """The data with their mask, and one value in all numbers of the rows that it leaves out."""
+    """The data with a mask, and one value in all numbers of the masked rows."""
     data = data.clone()
     for key, entry in data.items(True, True):
         if entry.is_floating_point():
@@ -61,7 +61,7 @@ class ReductionChecks:
 
     @pytest.mark.parametrize("key", [("collector", "mask"), "valid"])
     def test_masked_rows_do_not_count_in_any_term(self, case: Case, key: Any) -> None:
-        """No term may mix rows before it is reduced, nor average them itself."""
+        """No term may combine or average rows before it is reduced."""
         loss, data = case.make(), case.batch()
         rows = reduced(case, "none", data)
         mask = some_rows(data)
@@ -75,7 +75,7 @@ class ReductionChecks:
 
     @pytest.mark.parametrize("padding", [float("nan"), 7.0])
     def test_padded_rows_may_hold_anything(self, case: Case, padding: float) -> None:
-        """What a mask leaves out changes no loss, gradient, metric or priority."""
+        """Masked rows change no loss, gradient, metric or priority."""
         mask = some_rows(case.batch())
         results: list[Any] = []
         for value in (0.0, padding):
@@ -150,7 +150,7 @@ class ReductionChecks:
 
 
 def draw_zeros(patch: pytest.MonkeyPatch) -> None:
-    """Makes torch draw zeros, so that a row's losses do not depend on the rows before it."""
+    """Makes torch draw zeros, so that a row's losses do not depend on earlier rows."""
     for name in ("randn", "randn_like", "rand", "rand_like", "normal"):
         drawn = getattr(torch, name)
         patch.setattr(torch, name, lambda *x, drawn=drawn, **o: torch.zeros_like(drawn(*x, **o)))
@@ -162,7 +162,7 @@ class OfflineReductionChecks:
     def test_padded_rows_count_in_no_metric_and_no_priority(
         self, case: Case, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        """The metrics are means over the rows that the mask leaves; the others' priority is 0."""
+        """Metrics are means over the valid rows; the priority of the others is 0."""
         loss, mask = case.make(), some_rows(case.batch())
         left, data = case.batch()[mask], padded(case.batch(), mask, 7.0)
         draw_zeros(monkeypatch)
@@ -175,7 +175,7 @@ class OfflineReductionChecks:
         torch.testing.assert_close(priority[mask], left[loss.tensor_keys.priority])
 
     def test_methods_leave_the_input_and_are_the_terms_of_forward(self, case: Case) -> None:
-        """A method returns its term and its metrics; ``forward`` gathers them in update order."""
+        """A method returns its term and metrics; ``forward`` collects them in update order."""
         loss, data = case.make(), case.batch()
         before, values = dict(data.items(True, True)), data.clone()
         torch.manual_seed(0)
@@ -192,5 +192,5 @@ class OfflineReductionChecks:
 
 
 def _about(what: str) -> Any:
-    """The message of a comparison, which names what was compared."""
+    """A message for a comparison that names the compared entry."""
     return lambda message: f"{what}: {message}"

@@ -1,4 +1,4 @@
-"""Data that a loss refuses before it writes anything."""
+"""Checks of the errors that a loss raises before it writes anything."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def flat(value: Tensor) -> Tensor:
 
 
 class RefusalChecks:
-    """Checks of what is refused, for every loss."""
+    """Checks of errors, for every loss."""
 
     def test_actions_of_another_size_are_refused(self, case: Case) -> None:
-        """``self.rows`` and ``self.call`` name what a network cannot read."""
+        """``self.rows`` and ``self.call`` raise this error."""
         loss, data = case.make(), case.batch()
         key = loss.tensor_keys.action
         categorical = data[key].ndim == len(case.shape)
@@ -36,7 +36,7 @@ class RefusalChecks:
 
     @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
     def test_numbers_that_are_not_finite_are_refused(self, case: Case, bad: float) -> None:
-        """``self.rows`` finds them, on CPU and not compiled."""
+        """``self.rows`` raises this error, on CPU and not compiled."""
         loss = case.make()
         for key in (key for key in loss.in_keys if case.batch()[key].is_floating_point()):
             data = case.batch()
@@ -45,21 +45,21 @@ class RefusalChecks:
 
 
 class OfflineRefusalChecks:
-    """Checks of what is refused, for losses with critics."""
+    """Checks of errors, for losses with critics."""
 
     @pytest.mark.parametrize("key", ["reward", "done", "terminated"])
     @pytest.mark.parametrize("change", [wider, flat])
     def test_rewards_and_flags_of_another_shape_are_refused(
         self, case: Case, key: str, change: Callable[[Tensor], Tensor]
     ) -> None:
-        """``self.temporal_difference`` finds them."""
+        """``self.temporal_difference`` raises this error."""
         data = case.batch()
         data["next", key] = value = change(data["next", key])
         words = repr(("next", key)), str(tuple(value.shape)), f"valid: {(*case.shape, 1)}"
         refused(case.make(), data, *words)
 
     def test_next_observations_of_another_batch_are_refused(self, case: Case) -> None:
-        """``self.rows(..., after=True)`` finds them."""
+        """``self.rows(..., after=True)`` raises this error."""
         loss, data = case.make(), case.batch()
         outcomes = loss.outcome_keys
         key = next(key for key in loss.in_keys if key[0] == "next" and key not in outcomes)

@@ -1,4 +1,4 @@
-"""State, copies, types, devices, and whether training works at all."""
+"""Checks of state, copies, dtypes, devices, and training."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torchrl_bmrl.testing.measures import all_of, assert_same, reached, run, sam
 
 
 def pickled(loss: LossModule) -> Any:
-    """A copy, as another process gets it."""
+    """A copy, as it is sent to another process."""
     return pickle.loads(pickle.dumps(loss))
 
 
@@ -39,7 +39,7 @@ class StateChecks:
     def test_state_dict_is_the_same_after_use_and_loads_strictly_both_ways(
         self, case: Case
     ) -> None:
-        """Networks, targets and coefficients are in it, and nothing that a call makes."""
+        """It contains networks, targets and coefficients, and nothing that a call adds."""
         fresh, used = case.make(), case.make(seed=1)
         before = state(used)
         losses = run(used, case.batch())
@@ -73,7 +73,7 @@ class StateChecks:
         assert any(not torch.equal(value, before[key]) for key, value in state(twin).items())
 
     def test_assigned_parameters_are_used_from_the_next_call_on(self, case: Case) -> None:
-        """A loss that keeps tensors from its first call would go on with the old ones."""
+        """A loss that stores tensors at its first call would continue with the old ones."""
         for name in sorted(all_of(case.trains)):
             loss, expected = case.make(), case.make()
             other = moved(getattr(loss, f"{name}_params"))
@@ -85,7 +85,7 @@ class StateChecks:
             assert_same(losses, run(expected, case.batch()), f"with other {name}_params")
 
     def test_a_functional_call_uses_the_given_parameters(self, case: Case) -> None:
-        """Parameters are put in by ``with params.to_module(loss):``, and taken out after it."""
+        """``with params.to_module(loss):`` replaces the parameters inside the block."""
         loss, other = case.make(), case.make(seed=1)
         before, expected = run(loss, case.batch()), run(other, case.batch())
         params = TensorDict.from_module(other)
@@ -100,7 +100,7 @@ class StateChecks:
     def test_losses_have_the_dtype_of_networks_and_data(
         self, case: Case, dtype: torch.dtype, converted: bool
     ) -> None:
-        """Register numbers by ``register_coefficients``; make tensors of the data's type."""
+        """Use ``register_coefficients`` for numbers; give new tensors the data's dtype."""
         other = torch.float32 if dtype == torch.float64 else torch.float64
         loss = case.make(dtype=other).to(dtype) if converted else case.make(dtype=dtype)
         data = case.batch(dtype=dtype)
@@ -113,7 +113,7 @@ class StateChecks:
         assert {key for key, x in loss.state_dict().items() if x.dtype == other} == set()
 
     def test_training_lowers_the_losses_on_one_batch(self, case: Case) -> None:
-        """Terms that follow another network are named in ``need_not_fall``."""
+        """Name terms that follow another network in ``need_not_fall``."""
         torch.manual_seed(0)
         loss, data = case.make(), case.batch()
         updater = SoftUpdate(loss, tau=0.02) if case.targets else None
@@ -136,7 +136,7 @@ class StateChecks:
 
     @needs_cuda
     def test_a_loss_moves_to_the_gpu(self, case: Case) -> None:
-        """Make tensors on the device of the data."""
+        """Make new tensors on the device of the data."""
         loss, data = case.make().to("cuda"), case.batch().to("cuda")
         losses = loss(data)
         total(losses).backward()
@@ -147,7 +147,7 @@ class StateChecks:
 
     @needs_cuda
     def test_an_update_replayed_as_a_cuda_graph_is_the_update(self, case: Case) -> None:
-        """A loss must not read a number of the GPU in Python."""
+        """A loss must not read a number from the GPU in Python."""
         results = []
         term = f"loss_{'qvalue' if 'qvalue' in case.trains else next(iter(case.trains))}"
         for graphed in (False, True):
@@ -166,7 +166,7 @@ class StateChecks:
             step = CudaGraphModule(update, in_keys=[], out_keys=[], warmup=5) if graphed else update
             results.append([step(data.clone())[term].item() for _ in range(20)])
         assert len(set(results[1][10:])) == 10
-        # Capturing draws and updates once more, so that the two are close, not equal.
+        # Capturing draws and updates once more, so the results are close, but not equal.
         plain, replayed = (sum(history[-5:]) / 5 for history in results)
         assert replayed == pytest.approx(plain, rel=0.5)
 
@@ -175,7 +175,7 @@ class OfflineStateChecks:
     """Checks of the batch's shape, for losses with critics."""
 
     def test_nested_batch_dimensions_are_rows_like_others(self, case: Case) -> None:
-        """``self.rows`` gives the batch's shape also to keyword calls."""
+        """``self.rows`` determines the batch's shape for keyword calls, too."""
         loss = case.make(reduction="none")
         data = case.batch(2, 4)
         flat = data.clone().reshape(8)
