@@ -105,7 +105,7 @@ def test_asked_to_stop_a_stage_keeps_what_it_did_and_goes_on_to_the_same_result(
             patch.setattr(f"{module}.run_jobs", counting)
         assert ends(run, tmp_path / "run", two_stage) == 143
     said = capsys.readouterr().err
-    assert "stopped by SIGTERM; what was done is kept, the same command goes on" in said
+    assert "stopped by SIGTERM; finished work is saved, the same command continues it" in said
     assert "Traceback" not in said
     found = sorted((tmp_path / "run").glob(files))
     if files.endswith("safetensors"):
@@ -261,7 +261,7 @@ def test_a_full_disk_is_named_in_one_line_and_what_was_kept_stays(
         assert ends(run, folder, two_stage) == 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert f"/{place}/" in said
-    assert "No space left on device; what was done is kept, the same command goes on" in said
+    assert "No space left on device; finished work is saved, the same command continues it" in said
     assert not list(folder.rglob("*.tmp"))
     before = times(folder)
     run(folder, two_stage)
@@ -303,7 +303,7 @@ def test_a_run_whose_logger_fails_goes_on_and_says_so_once(
     monkeypatch.setattr(CSVLogger, "log_scalar", unreachable)
     run(collected, stage1, tasks("reach", "lift"))
     said = capsys.readouterr().err
-    assert said.count("metrics are logged no more, from step 4 on (server not reached)") == 2
+    assert said.count("metrics from step 4 on are not logged (server not reached)") == 2
     assert contents(collected, "bcq/*/*") == contents(finished, "bcq/*/*")
 
 
