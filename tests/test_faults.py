@@ -179,9 +179,9 @@ def test_a_run_goes_on_from_the_checkpoint_before_a_damaged_one(
     (copied / path).write_bytes(data)
     run(copied, two_stage)
     said = capfd.readouterr().err
-    assert f"{path}: not a whole checkpoint" in said
-    assert "its checksum differs" in said
-    assert "going on from checkpoint.1.safetensors" in said
+    assert f"{path}: not a complete safetensors checkpoint" in said
+    assert "the checksum differs" in said
+    assert "training continues from checkpoint.1.safetensors" in said
     (copied / path).with_name("checkpoint.damaged.safetensors").unlink()
     everything = ("bcq/*/*", "distill/*", "results.csv", "tables/*", "logs/*/scalars/*")
     assert contents(copied, *everything) == contents(finished, *everything)
@@ -334,9 +334,9 @@ def broken(name: str, update: int) -> Any:
     ("what", "says"),
     [
         ("nan", r"loss_qvalue is nan"),
-        ("exploding", r"pred_value is .*, beyond .*; it explodes"),
-        ("dead", r"all candidates of a state are one action"),
-        ("saturated", r"100% of the proposed actions' components lie at a bound"),
+        ("exploding", r"pred_value is .*, above .*; the training has diverged"),
+        ("dead", r"all candidates of a state are equal"),
+        ("saturated", r"100% of the proposed action components lie at a bound"),
     ],
 )
 @pytest.mark.parametrize("stacked", [False, True])
@@ -373,7 +373,7 @@ def test_what_goes_wrong_is_named_within_one_logging_interval_and_the_good_check
     assert ends(run, collected, stage1, *overrides) == 1
     said = capsys.readouterr().err
     assert re.search(rf"error: bcq (reach|lift), update 8: {says}", said), said
-    assert "checkpoint is kept" in said
+    assert "checkpoint stays" in said
     path = collected / "bcq" / "lift" / "checkpoint.safetensors"
     state, metadata = load_checkpoint(path, kind="bcq")
     assert metadata["updates"] == 4
@@ -384,8 +384,8 @@ def test_what_goes_wrong_is_named_within_one_logging_interval_and_the_good_check
     ("what", "says"),
     [
         ("nan", r"loss_\w+ is nan"),
-        ("dead", r"all candidates of a state are one action"),
-        ("saturated", r"100% of the proposed actions' components lie at a bound"),
+        ("dead", r"all candidates of a state are equal"),
+        ("saturated", r"100% of the proposed action components lie at a bound"),
     ],
 )
 def test_a_student_that_goes_wrong_is_named_within_one_logging_interval(

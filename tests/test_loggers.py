@@ -129,10 +129,8 @@ def test_a_logger_that_cannot_be_made_is_said_and_csv_files_take_its_place(
     logger = make_logger(kind, tmp_path, "bcq_lift")
     log_metrics(logger, {"loss": 0.5}, 10)
     (said,) = caplog.messages
-    assert (
-        f"bcq_lift: {kind} is not available (no route to host); metrics go to CSV files in {tmp_path}"
-        in said
-    )
+    assert f"bcq_lift: {kind} is not available (no route to host); metrics go to CSV files" in said
+    assert str(tmp_path) in said
     assert (tmp_path / "logs" / "bcq_lift" / "scalars" / "loss.csv").read_text() == "10,0.5\n"
 
 
