@@ -251,8 +251,8 @@ def test_a_damaged_newest_is_said_and_set_aside_and_the_one_before_is_the_newest
     assert found is not None
     assert found[0] == {"step": 3 - damaged}
     said = caplog.text
-    assert f"{path}: not a whole checkpoint" in said
-    assert f"going on from checkpoint.{damaged}.safetensors" in said
+    assert f"{path}: not a complete safetensors checkpoint" in said
+    assert f"training continues from checkpoint.{damaged}.safetensors" in said
     assert path.with_name("checkpoint.damaged.safetensors").exists()
     path.with_name("checkpoint.damaged.safetensors").unlink()
     assert steps(path)["checkpoint.safetensors"] == 3 - damaged
@@ -265,7 +265,7 @@ def test_when_all_are_damaged_the_newest_is_named_and_all_stay(path: Path) -> No
     keep_four(path, 2)
     for file in path.parent.iterdir():
         file.write_bytes(b"x")
-    with pytest.raises(CheckpointError, match="not a whole checkpoint") as info:
+    with pytest.raises(CheckpointError, match="not a complete safetensors checkpoint") as info:
         load_newest(path, kind="example")
     assert info.value.path == path
     assert len(list(path.parent.iterdir())) == 2
@@ -304,12 +304,12 @@ def test_a_missing_file_or_a_folder_is_refused_by_name(tmp_path: Path) -> None:
 def test_a_truncated_file_is_refused_by_name(saved: Path, keep: float) -> None:
     data = saved.read_bytes()
     saved.write_bytes(data[: int(keep * len(data)) if keep == 0.5 else int(keep)])
-    refused(saved, "not a whole checkpoint")
+    refused(saved, "not a complete safetensors checkpoint")
 
 
 def test_trailing_bytes_are_refused_by_name(saved: Path) -> None:
     saved.write_bytes(saved.read_bytes() + b"\0\0\0\0")
-    refused(saved, "not a whole checkpoint")
+    refused(saved, "not a complete safetensors checkpoint")
 
 
 def test_a_checkpoint_without_a_checksum_is_refused_by_what_is_missing(path: Path) -> None:
@@ -326,7 +326,7 @@ def test_a_flipped_bit_in_the_header_s_length_is_refused_by_name(saved: Path, bi
     data = bytearray(saved.read_bytes())
     data[bit // 8] ^= 1 << bit % 8
     saved.write_bytes(data)
-    refused(saved, "not a whole checkpoint")
+    refused(saved, "not a complete safetensors checkpoint")
 
 
 def test_any_flipped_bit_is_refused_by_name_or_changes_nothing(saved: Path) -> None:
@@ -352,7 +352,7 @@ def test_a_pickle_is_refused_and_not_run(path: Path) -> None:
 
     path.parent.mkdir()
     torch.save({"net": network().state_dict(), "trap": Trap()}, path)
-    refused(path, "not a whole checkpoint")
+    refused(path, "not a complete safetensors checkpoint")
     assert not (path.parent / "trapped").exists()
 
 
@@ -362,7 +362,7 @@ def test_safetensors_of_another_program_are_refused_by_name(path: Path) -> None:
     path.parent.mkdir()
     for header in (None, {"format": "pt"}, {"checkpoint": "not json"}, {"checkpoint": "{}"}):
         save_file({"a": torch.ones(2)}, path, header)
-        refused(path, "not a whole checkpoint")
+        refused(path, "not a complete safetensors checkpoint")
 
 
 def test_another_kind_is_refused_with_the_valid_one(saved: Path) -> None:
@@ -435,7 +435,7 @@ def with_header(path: Path, header: Any) -> None:
 )
 def test_a_header_of_another_structure_is_refused_by_name(path: Path, header: Any) -> None:
     with_header(path, header)
-    refused(path, "not a whole checkpoint")
+    refused(path, "not a complete safetensors checkpoint")
 
 
 def test_a_header_nested_without_end_is_refused_by_name(path: Path) -> None:
@@ -444,7 +444,7 @@ def test_a_header_nested_without_end_is_refused_by_name(path: Path) -> None:
     path.parent.mkdir()
     text = '{"state": ' + "[" * 100_000 + "]" * 100_000 + "}"
     path.write_bytes(save({"a": torch.ones(1)}, {"checkpoint": text}))
-    refused(path, "not a whole checkpoint")
+    refused(path, "not a complete safetensors checkpoint")
 
 
 @pytest.mark.parametrize("number", [float("nan"), float("inf")])
@@ -453,21 +453,21 @@ def test_parameters_that_are_not_finite_are_not_acted_with(path: Path, number: f
     key = next(key for key in state if key.endswith("0.weight"))
     state[key][1, 2] = number
     save_checkpoint(path, {"module": state}, {"kind": "bcq", "loss": SMALL})
-    with pytest.raises(CheckpointError, match=f"'{key}' holds numbers that are not finite"):
+    with pytest.raises(CheckpointError, match=f"'{key}' contains numbers that are not finite"):
         load_bcq_loss(path)
 
 
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        (None, "says nothing of its networks"),
+        (None, "contains no networks"),
         ({**SMALL, "num_cells": [10**9]}, "num_cells is .*no tensor in the file is that large"),
         ({**SMALL, "num_cells": [8] * 999}, "num_cells is .*no tensor in the file is that large"),
         ({**SMALL, "num_qvalue_nets": 10**9}, "num_qvalue_nets is .*that large"),
-        ({**SMALL, "num_cells": "eight"}, "not the settings of networks"),
-        ({**SMALL, "num_cells": [-1]}, "not the settings of networks"),
-        ({**SMALL, "hidden": 8}, "not the settings of networks"),
-        ({**SMALL, "latent_clip": -1.0}, "not the settings of networks"),
+        ({**SMALL, "num_cells": "eight"}, "its options build no networks"),
+        ({**SMALL, "num_cells": [-1]}, "its options build no networks"),
+        ({**SMALL, "hidden": 8}, "its options build no networks"),
+        ({**SMALL, "latent_clip": -1.0}, "its options build no networks"),
     ],
 )
 def test_settings_of_no_networks_are_refused_before_any_are_made(

@@ -173,7 +173,7 @@ def test_a_worker_killed_in_an_episode_changes_no_byte(
     patch_workers(KILL_THE_FIRST.format(flag=str(tmp_path / "killed")))
     again = run(tmp_path / "two", workers=2)
     assert (tmp_path / "killed").exists()
-    said = [line for line in capfd.readouterr().err.splitlines() if "done again" in line]
+    said = [line for line in capfd.readouterr().err.splitlines() if "retried" in line]
     assert len(said) == 1
     assert said[0].startswith("collecting demonstrations: a worker was killed by signal 9")
     for task, path in collected.items():

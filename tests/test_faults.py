@@ -105,7 +105,7 @@ def test_asked_to_stop_a_stage_keeps_what_it_did_and_goes_on_to_the_same_result(
             patch.setattr(f"{module}.run_jobs", counting)
         assert ends(run, tmp_path / "run", two_stage) == 143
     said = capsys.readouterr().err
-    assert "stopped by SIGTERM; what was done is kept, the same command goes on" in said
+    assert "stopped by SIGTERM; finished work is saved, the same command continues it" in said
     assert "Traceback" not in said
     found = sorted((tmp_path / "run").glob(files))
     if files.endswith("safetensors"):
@@ -179,9 +179,9 @@ def test_a_run_goes_on_from_the_checkpoint_before_a_damaged_one(
     (copied / path).write_bytes(data)
     run(copied, two_stage)
     said = capfd.readouterr().err
-    assert f"{path}: not a whole checkpoint" in said
-    assert "its checksum differs" in said
-    assert "going on from checkpoint.1.safetensors" in said
+    assert f"{path}: not a complete safetensors checkpoint" in said
+    assert "the checksum differs" in said
+    assert "training continues from checkpoint.1.safetensors" in said
     (copied / path).with_name("checkpoint.damaged.safetensors").unlink()
     everything = ("bcq/*/*", "distill/*", "results.csv", "tables/*", "logs/*/scalars/*")
     assert contents(copied, *everything) == contents(finished, *everything)
@@ -261,7 +261,7 @@ def test_a_full_disk_is_named_in_one_line_and_what_was_kept_stays(
         assert ends(run, folder, two_stage) == 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert f"/{place}/" in said
-    assert "No space left on device; what was done is kept, the same command goes on" in said
+    assert "No space left on device; finished work is saved, the same command continues it" in said
     assert not list(folder.rglob("*.tmp"))
     before = times(folder)
     run(folder, two_stage)
@@ -303,7 +303,7 @@ def test_a_run_whose_logger_fails_goes_on_and_says_so_once(
     monkeypatch.setattr(CSVLogger, "log_scalar", unreachable)
     run(collected, stage1, tasks("reach", "lift"))
     said = capsys.readouterr().err
-    assert said.count("metrics are logged no more, from step 4 on (server not reached)") == 2
+    assert said.count("metrics from step 4 on are not logged (server not reached)") == 2
     assert contents(collected, "bcq/*/*") == contents(finished, "bcq/*/*")
 
 
@@ -334,9 +334,9 @@ def broken(name: str, update: int) -> Any:
     ("what", "says"),
     [
         ("nan", r"loss_qvalue is nan"),
-        ("exploding", r"pred_value is .*, beyond .*; it explodes"),
-        ("dead", r"all candidates of a state are one action"),
-        ("saturated", r"100% of the proposed actions' components lie at a bound"),
+        ("exploding", r"pred_value is .*, above .*; the training has diverged"),
+        ("dead", r"all candidates of a state are equal"),
+        ("saturated", r"100% of the proposed action components lie at a bound"),
     ],
 )
 @pytest.mark.parametrize("stacked", [False, True])
@@ -373,7 +373,7 @@ def test_what_goes_wrong_is_named_within_one_logging_interval_and_the_good_check
     assert ends(run, collected, stage1, *overrides) == 1
     said = capsys.readouterr().err
     assert re.search(rf"error: bcq (reach|lift), update 8: {says}", said), said
-    assert "checkpoint is kept" in said
+    assert "checkpoint stays" in said
     path = collected / "bcq" / "lift" / "checkpoint.safetensors"
     state, metadata = load_checkpoint(path, kind="bcq")
     assert metadata["updates"] == 4
@@ -384,8 +384,8 @@ def test_what_goes_wrong_is_named_within_one_logging_interval_and_the_good_check
     ("what", "says"),
     [
         ("nan", r"loss_\w+ is nan"),
-        ("dead", r"all candidates of a state are one action"),
-        ("saturated", r"100% of the proposed actions' components lie at a bound"),
+        ("dead", r"all candidates of a state are equal"),
+        ("saturated", r"100% of the proposed action components lie at a bound"),
     ],
 )
 def test_a_student_that_goes_wrong_is_named_within_one_logging_interval(

@@ -175,7 +175,7 @@ def test_a_run_that_was_killed_while_it_took_files_holds_no_others_when_it_goes_
     open_run(base, SETTINGS)
     (base / "data").mkdir()
     (base / "data" / "reach.hdf5").write_text("of seed 0")
-    monkeypatch.setattr(runs, "_adopt", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr(runs, "link_or_copy", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         open_run(run, SETTINGS | {"base": str(base)})
     monkeypatch.undo()
@@ -262,7 +262,7 @@ def test_settings_that_refer_to_each_other_are_refused_before_they_grow(tmp_path
     lines = ["a0: &a0 {x: 1}"]
     lines += [f"a{i}: &a{i} {{x: *a{i - 1}, y: *a{i - 1}}}" for i in range(1, 60)]
     (tmp_path / "config.yaml").write_text("\n".join(lines))
-    with pytest.raises(DataError, match=r"config\.yaml: not YAML \(a reference; valid"):
+    with pytest.raises(DataError, match=r"config\.yaml: not YAML \(contains a reference; valid"):
         read_settings(tmp_path)
 
 

@@ -142,7 +142,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         paths[kind] = folder / f"{kind}.safetensors"
         metadata = {"kind": kind, "loss": SMALL, "student": options, **said}
         optimizers = {"all": make_adam(module.parameters(), lr=0.1)}
-        checkpoint.keep_training(paths[kind], module, optimizers, metadata, device="cpu", keep=1)
+        checkpoint.save_training(paths[kind], module, optimizers, metadata, device="cpu", keep=1)
     return paths
 
 

@@ -109,7 +109,7 @@ def test_an_optimizer_of_parameters_that_the_loss_does_not_read_is_refused() -> 
     critics = make_critics(2)
     loss = BCQLoss(ActionVAE(*DIMS).double(), critics, bounds=(-1.0, 1.0))
     optimizer = make_adam([p for critic in critics for p in critic.parameters()], lr=1e-2)
-    with refused("does not depend on the optimizer's parameters; valid: the loss's own"):
+    with refused("does not depend on the optimizer's parameters; valid: parameters of the loss"):
         gradient_step(optimizer, loss.qvalue_loss(transitions(8))[0])
     with refused("no parameters"):
         make_adam([], lr=1e-2)

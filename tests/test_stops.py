@@ -41,7 +41,7 @@ def test_a_signal_stops_at_the_next_point_and_not_before(number: signal.Signals)
         check_stop()
         signal.raise_signal(number)
         done.append("what goes on is finished")
-        with pytest.raises(StoppedError, match=f"stopped by {number.name}; what was done is kept"):
+        with pytest.raises(StoppedError, match=f"stopped by {number.name}; finished work is saved"):
             check_stop()
     assert done
     check_stop()  # it is over
@@ -91,20 +91,20 @@ def test_another_thread_leaves_signals_alone() -> None:
             1,
             "error: runs/a: in use by process 12 on node3",
         ),
-        (StoppedError(signal.SIGTERM), 143, "stopped by SIGTERM; what was done is kept"),
+        (StoppedError(signal.SIGTERM), 143, "stopped by SIGTERM; finished work is saved"),
         (StoppedError(signal.SIGINT), 130, "stopped by SIGINT"),
-        (KeyboardInterrupt(), 130, "interrupted; what was done is kept"),
+        (KeyboardInterrupt(), 130, "interrupted; finished work is saved"),
         (
             OSError(28, "No space left on device", "runs/a/x"),
             1,
             "runs/a/x: No space left on device",
         ),
-        (OSError("no such device"), 1, "error: no such device; what was done is kept"),
+        (OSError("no such device"), 1, "error: no such device; finished work is saved"),
         (MemoryError(), 1, "error: out of memory; fewer workers need less"),
         (
             torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB.\nMore."),
             1,
-            "error: CUDA out of memory. Tried to allocate 2 GiB.; lower bcq.batch_size; what",
+            "error: CUDA out of memory. Tried to allocate 2 GiB.; lower bcq.batch_size; finished",
         ),
     ],
 )

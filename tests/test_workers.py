@@ -100,7 +100,7 @@ def test_the_job_of_a_killed_worker_is_reported_and_done_again_and_no_other(
     said = [line for line in caplog.messages if "killed" in line]
     assert len(said) == 2
     assert "a worker was killed by signal 9 (out of memory?) in job 2 of 4" in said[0]
-    assert "done again" in said[1]
+    assert "retried" in said[1]
 
 
 @pytest.mark.slow
@@ -154,7 +154,7 @@ def test_a_worker_that_hangs_is_named_and_killed_and_its_job_done_again(
     jobs = [("hangs", tmp_path), ("fine", tmp_path)]
     assert run_jobs(hang_once, jobs, workers=2, **OPTIONS) == ["hangs", "fine"]
     said = caplog.text
-    assert "a worker said nothing for 20 s and was killed in job 1 of 2; the job is done" in said
+    assert "a worker reported nothing for 20 s and was killed in job 1 of 2; the job is" in said
 
 
 def work_until_stopped(job: tuple[str, Path], report: Report) -> None:

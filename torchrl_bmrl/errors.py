@@ -179,7 +179,7 @@ class StoppedError(BMRLError):
 
     Example:
         >>> print(StoppedError(signal.SIGTERM))
-        stopped by SIGTERM; what was done is kept, the same command goes on
+        stopped by SIGTERM; finished work is saved, the same command continues it
     """
 
     def __init__(self, signal: signal.Signals) -> None:
@@ -187,7 +187,9 @@ class StoppedError(BMRLError):
         super().__init__(signal)
 
     def __str__(self) -> str:
-        return f"stopped by {self.signal.name}; what was done is kept, the same command goes on"
+        return (
+            f"stopped by {self.signal.name}; finished work is saved, the same command continues it"
+        )
 
 
 def _plural(noun: str) -> str:

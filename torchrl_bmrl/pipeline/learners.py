@@ -19,10 +19,10 @@ from torchrl_bmrl.pipeline.agents import make_bcq_loss
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.settings import BCQSettings
 from torchrl_bmrl.training.checkpoint import (
-    keep_training,
     load_checkpoint,
     resume_training,
     save_checkpoint,
+    save_training,
 )
 from torchrl_bmrl.training.health import check_metrics, check_proposals, value_limits
 from torchrl_bmrl.training.update import Update, accelerate, gradient_step, make_adam
@@ -202,7 +202,7 @@ class Agents:
             metadata = {"kind": self.kind, "names": self.names, "updates": update}
             metadata |= {"evaluations": self.evaluations, "diverged": self.diverged}
             metadata["settings"] = self.run.settings.deciding()
-        keep_training(
+        save_training(
             self.path,
             self.loss,
             self.optimizers,

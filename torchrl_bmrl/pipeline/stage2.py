@@ -23,7 +23,7 @@ from torchrl_bmrl.pipeline.settings import DistillSettings
 from torchrl_bmrl.pipeline.stage1 import sizes_of
 from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
 from torchrl_bmrl.run.workers import Report
-from torchrl_bmrl.training.checkpoint import keep_training, resume_training
+from torchrl_bmrl.training.checkpoint import resume_training, save_training
 from torchrl_bmrl.training.fit import Every, fit
 from torchrl_bmrl.training.health import check_metrics, check_proposals
 from torchrl_bmrl.training.update import accelerate, gradient_step, keep_freed_memory, make_adam
@@ -178,7 +178,7 @@ def train_student(job: tuple[Run, None], report: Report) -> None:
             "settings": settings.deciding(),
             "statistics": run.statistics.to_lists(),
         }
-        keep_training(
+        save_training(
             path,
             own,
             {"student": optimizer},

@@ -1,1 +1,1 @@
-"""A run's folder and its processes: settings, locks, stops, workers, progress."""
+"""The folder and the processes of a run: settings, locks, stops, workers, progress."""

@@ -1,6 +1,6 @@
-"""Imported first by commands: an error of this library at import is one line and exit code 1.
+"""Prints errors that this library raises at import as one line; commands import this first.
 
-:func:`torchrl_bmrl.run.command_line.exit_codes` does this for what comes after the imports.
+:func:`torchrl_bmrl.run.command_line.exit_codes` handles errors after the imports.
 """
 
 from __future__ import annotations
@@ -11,12 +11,14 @@ from types import TracebackType
 from torchrl_bmrl.errors import BMRLError
 
 
-def _say(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+def _print_error(
+    kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
     if isinstance(error, BMRLError):
         print(f"error: {error}", file=sys.stderr, flush=True)
     else:
-        _before(kind, error, trace)
+        _default(kind, error, trace)
 
 
-_before = sys.excepthook
-sys.excepthook = _say
+_default = sys.excepthook
+sys.excepthook = _print_error

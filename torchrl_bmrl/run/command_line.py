@@ -1,4 +1,4 @@
-"""How a command ends: one line and an exit code for whatever may be expected to go wrong."""
+"""Turns expected errors of a command into one line on stderr and an exit code."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from torchrl_bmrl.errors import BMRLError, StoppedError
 from torchrl_bmrl.run.logs import write_line
 from torchrl_bmrl.run.stops import stop_on_signals
 
-_KEPT = "what was done is kept, the same command goes on"
-_LESS = "fewer workers need less"
+_SAVED = "finished work is saved, the same command continues it"
+_NO_MEMORY = f"error: out of memory; fewer workers need less; {_SAVED}"
 
 
 @contextmanager
 def exit_codes(*, out_of_memory: str = "") -> Iterator[None]:
-    """Ends the process as a command should.
+    """Turns the errors of the block into exit codes.
 
-    Exit code 1 and one line on stderr for this library's errors, for what the operating system
-    refuses (a full disk, a folder that cannot be written) and for want of memory; 128 and the
-    signal's number for a run that was asked to stop, 143 for SIGTERM and 130 for Ctrl-C. Any other
-    error is a mistake of the program, and shows its traceback.
+    The exit code is 1, with one line on stderr, for errors of this library, of the operating system
+    (a full disk, a read-only folder) and for lack of memory. It is 128 plus the signal's number for
+    a run that was stopped: 143 for SIGTERM, 130 for Ctrl-C. Any other error is a bug and shows its
+    traceback.
 
     Args:
-        out_of_memory: what may help when a GPU's memory is not enough.
+        out_of_memory: advice that is printed when the GPU runs out of memory.
 
     Raises:
         SystemExit: in all of these cases; its cause is the error.
@@ -47,25 +47,23 @@ def exit_codes(*, out_of_memory: str = "") -> Iterator[None]:
         write_line(str(stop))
         raise SystemExit(128 + stop.signal) from stop
     except KeyboardInterrupt as interrupt:  # the second signal
-        write_line(f"interrupted; {_KEPT}")
+        write_line(f"interrupted; {_SAVED}")
         raise SystemExit(128 + signal.SIGINT) from interrupt
     except BMRLError as error:
         write_line(f"error: {error}")
         raise SystemExit(1) from error
     except torch.OutOfMemoryError as error:
         reason = str(error).strip().partition("\n")[0]
-        write_line(f"error: {'; '.join(filter(None, [reason, out_of_memory, _KEPT]))}")
+        write_line(f"error: {'; '.join(filter(None, [reason, out_of_memory, _SAVED]))}")
         raise SystemExit(1) from error
-    except MemoryError as error:
-        write_line(f"error: out of memory; {_LESS}; {_KEPT}")
-        raise SystemExit(1) from error
-    except RuntimeError as error:
-        if "can't allocate memory" not in str(error):  # which PyTorch says of the CPU's
+    except (MemoryError, RuntimeError) as error:
+        # PyTorch raises a RuntimeError when the CPU's memory is full.
+        if not isinstance(error, MemoryError) and "can't allocate memory" not in str(error):
             raise
-        write_line(f"error: out of memory; {_LESS}; {_KEPT}")
+        write_line(_NO_MEMORY)
         raise SystemExit(1) from error
     except OSError as error:
         reason = error.strerror or str(error) or type(error).__name__
         path = f"{error.filename}: " if error.filename is not None else ""
-        write_line(f"error: {path}{reason}; {_KEPT}")
+        write_line(f"error: {path}{reason}; {_SAVED}")
         raise SystemExit(1) from error

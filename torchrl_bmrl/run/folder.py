@@ -1,4 +1,4 @@
-"""Run folders: what a run was told, on what it ran, and whether it may go on."""
+"""Run folders: the settings and package versions of a run, and whether it may be continued."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import logging
 import platform
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ FREE_TO_CHANGE = (
     "verbose",
     "checkpoint_interval",
     "keep_checkpoints",
-    # Sections of studies, in the folders of earlier versions.
+    # Sections of studies in folders of earlier versions.
     "human",
     "imitate",
     "interpolation",
@@ -43,10 +43,10 @@ FREE_TO_CHANGE = (
     "fqe",
     "baselines",
 )
-"""Settings that do not change a run's result, and so may differ when it goes on.
+"""Settings that may change when a run is continued, since its results do not depend on them.
 
-Studies of a finished run are among them; each is held to its own settings by its own folder.
-Presets and ablations are names of settings, which are compared themselves.
+A study of a finished run compares its settings in its own folder. A preset or an ablation is a
+name for settings that are compared themselves.
 """
 _START = ("seed", "tasks", "collect")
 ADOPTED: tuple[tuple[str, tuple[str, ...]], ...] = (
@@ -56,24 +56,23 @@ ADOPTED: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("evaluation/*-expert.csv", (*_START, "evaluate")),
     ("evaluation/*-bcq.csv", (*_START, "bcq", "evaluate")),
 )
-"""What a run takes from its base: files, and the settings that decide them."""
+"""Files that a run copies from its base, with the settings that they depend on."""
 PACKAGES = ("torchrl", "tensordict", "robosuite", "mujoco", "gymnasium", "numpy", "h5py")
 
 
 def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
-    """Creates a run folder, or checks that an existing one was told the same.
+    """Creates a run folder, or checks that an existing one has the same settings.
 
-    Writes ``config.yaml`` (everything that decides the run) and ``versions.json``. With ``base``
-    among the settings, another run's folder, a new run begins with those files of it that it would
-    only make again (:data:`ADOPTED`). Of several processes that create a folder at once, one does
-    and the others are checked.
+    Writes ``config.yaml`` (all settings) and ``versions.json``. If the setting ``base`` names the
+    folder of another run, a new run starts with those of its files that would come out the same
+    (:data:`ADOPTED`). Several processes may call this at once for one folder.
 
     Args:
         run_dir: the folder.
         settings: the resolved configuration.
 
     Raises:
-        ConfigError: if the folder holds a run with other settings; the first that differs is named.
+        ConfigError: naming the first setting that differs from the folder's run.
         DataError: if ``base`` is not a run's folder.
 
     Example:
@@ -89,20 +88,20 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
     if not path.exists():
         base = Path(settings["base"]) if settings.get("base") else None
         theirs = read_settings(base) if base else {}
-        # Torch itself names its build (2.14.1+cu130); its package's metadata may not.
+        # torch.__version__ contains the build (2.14.1+cu130); the package's metadata may not.
         versions = {"torch": str(torch.__version__)} | {name: _version(name) for name in PACKAGES}
         versions |= {"torchrl_bmrl": __version__, "python": platform.python_version()}
         if commit := _commit():
             versions["commit"] = commit
         write_atomic(run_dir / "versions.json", json.dumps(versions, indent=2) + "\n")
         write_atomic(path, yaml.safe_dump(dict(settings), sort_keys=False), replace=False)
-        if base:  # killed from here on, the run makes what is not there yet
-            patterns = [
-                pattern
-                for pattern, keys in ADOPTED
-                if all(theirs.get(key) == settings.get(key) for key in keys)
-            ]
-            _adopt(run_dir, base, patterns)
+        if base:  # if killed from here on, the run computes the missing files itself
+            for pattern, keys in ADOPTED:
+                if all(theirs.get(key) == settings.get(key) for key in keys):
+                    for source in base.glob(pattern):
+                        target = run_dir / source.relative_to(base)
+                        if not target.exists():  # another process may have made it
+                            link_or_copy(source, target)
     before, now = deciding(read_settings(run_dir)), deciding(settings)
     for key in sorted(before | now):
         if before.get(key) != now.get(key):
@@ -113,7 +112,7 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
 
 
 def deciding(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings that decide a run's result, by their dotted names.
+    """Returns the settings that a run's results depend on, by their dotted names.
 
     Example:
         >>> deciding({"seed": 0, "workers": 2, "bcq": {"lr": 0.001}})
@@ -122,27 +121,11 @@ def deciding(settings: Mapping[str, Any]) -> dict[str, Any]:
     return dict(flat({key: x for key, x in settings.items() if key not in FREE_TO_CHANGE}))
 
 
-def _adopt(run_dir: Path, base: Path, patterns: Iterable[str]) -> None:
-    """Takes another run's files."""
-    for pattern in patterns:
-        for source in base.glob(pattern):
-            target = run_dir / source.relative_to(base)
-            if target.exists():  # another process has made it already
-                continue
-            link_or_copy(source, target)
-
-
 def read_settings(run_dir: Path) -> dict[str, Any]:
-    """The configuration of a run folder.
-
-    Args:
-        run_dir: the folder.
-
-    Returns:
-        the settings as :func:`open_run` was given them, nested as they were.
+    """Returns the settings of a run folder, nested as in ``config.yaml``.
 
     Raises:
-        DataError: if there is none, or it is not YAML.
+        DataError: if the file is missing or not YAML.
 
     Example:
         >>> import tempfile
@@ -158,10 +141,7 @@ def read_settings(run_dir: Path) -> dict[str, Any]:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Reads a YAML file that holds a mapping.
-
-    Args:
-        path: the file.
+    """Reads a YAML file that contains a mapping.
 
     Raises:
         DataError: if the file is missing, not YAML, or not a mapping.
@@ -180,30 +160,24 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise DataError(path, None, f"not YAML ({error})") from error
     if not isinstance(content, dict):
-        raise DataError(path, None, f"holds a {type(content).__name__}; valid: a mapping")
+        raise DataError(path, None, f"contains a {type(content).__name__}; valid: a mapping")
     return content
 
 
 class _Loader(yaml.SafeLoader):
-    """Without references: a few lines of them grow to more than any memory."""
+    """Refuses references: a few lines of them can expand to more than any memory."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError("a reference; valid: settings written out")
+            raise yaml.YAMLError("contains a reference; valid: values written out")
         return super().compose_node(parent, index)
 
 
 def read_versions(run_dir: Path) -> dict[str, str]:
-    """Versions of what the run uses.
-
-    Args:
-        run_dir: the folder.
-
-    Returns:
-        versions by package, and of ``python``; ``"None"`` for a package that was not installed.
+    """Returns the versions that a run uses, by package and for ``python``; some may be ``"None"``.
 
     Raises:
-        DataError: if the folder has no ``versions.json``, or it is damaged.
+        DataError: if ``versions.json`` is missing or damaged.
 
     Example:
         >>> import tempfile
@@ -227,11 +201,11 @@ def _version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """Commit of the sources, with a ``+`` where they were changed since; ``None`` outside git."""
+    """Commit of the sources, with ``+`` if they were changed since; ``None`` outside git."""
     source = Path(__file__)
     git = ["git", "-C", str(source.parent)]
     try:
-        # An installed copy may lie within another project's repository, which ignores it.
+        # An installed copy may lie in another project's repository, which does not track it.
         subprocess.run(
             [*git, "ls-files", "--error-unmatch", source.name], capture_output=True, check=True
         )

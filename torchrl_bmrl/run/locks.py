@@ -1,4 +1,4 @@
-"""One run at a time in a folder, and none where nothing came of it."""
+"""Locks on run folders: one process at a time, and no folder left by a run that never started."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ with needs("recipes"):
 
 @contextlib.contextmanager
 def hold(folder: Path, names: Sequence[str] = ("run",)) -> Iterator[None]:
-    """Holds a folder, or named parts of it, for this process.
+    """Locks a folder, or named parts of it, for this process.
 
-    The operating system gives up a process's locks when it ends, however it ends: what a dead
-    process held is simply taken. ``.locks`` in the folder stays.
+    The operating system releases the locks of a process when it ends, also when it is killed. The
+    subfolder ``.locks`` stays.
 
     Args:
         folder: created if missing.
-        names: of the parts, in any order.
+        names: names of the parts, in any order.
 
     Raises:
-        FolderInUseError: naming the process and the host that hold it; nothing is held then.
+        FolderInUseError: naming the process and the host that have the lock; no part is locked
+            then.
 
     Example:
         >>> import tempfile
@@ -47,16 +48,15 @@ def hold(folder: Path, names: Sequence[str] = ("run",)) -> Iterator[None]:
     locks = folder / ".locks"
     locks.mkdir(parents=True, exist_ok=True)
     owner = {"process": os.getpid(), "host": socket.gethostname()}
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as stack:
         for name in sorted(names):
-            # Not the lock's own file, which must stay the same one.
-            said = locks / f"{name}.json"
-            lock = FileLock(locks / f"{name}.lock", timeout=0)
+            # Not in the lock file: writing it would replace the file that is locked.
+            owner_file = locks / f"{name}.json"
             try:
-                held.enter_context(lock)
+                stack.enter_context(FileLock(locks / f"{name}.lock", timeout=0))
             except Timeout:
-                raise FolderInUseError(folder, *_owner(said)) from None
-            write_atomic(said, json.dumps(owner) + "\n")
+                raise FolderInUseError(folder, *_owner(owner_file)) from None
+            write_atomic(owner_file, json.dumps(owner) + "\n")
         yield
 
 
@@ -64,18 +64,18 @@ def hold(folder: Path, names: Sequence[str] = ("run",)) -> Iterator[None]:
 def hold_run(
     run_dir: Path, settings: Mapping[str, Any], names: Sequence[str] = ("run",)
 ) -> Iterator[None]:
-    """Holds a run's folder (:func:`hold`) and opens it (:func:`~torchrl_bmrl.run.folder.open_run`).
+    """Locks a run folder (:func:`hold`) and opens it (:func:`~torchrl_bmrl.run.folder.open_run`).
 
-    Where an error comes before anything was done, what this has written is gone again: the folder
-    of a run that could not start, the locks in another run's.
+    If the block raises before it wrote any file, the files and folders that this function created
+    are removed.
 
     Args:
         run_dir: the folder, created if missing.
         settings: the resolved configuration.
-        names: of the parts to hold.
+        names: names of the parts to lock.
 
     Raises:
-        BMRLError: of ``hold`` and ``open_run``.
+        BMRLError: the errors of ``hold`` and ``open_run``.
 
     Example:
         >>> import tempfile
@@ -87,7 +87,7 @@ def hold_run(
         ...     folder.parent.exists()
         False
     """
-    before = set(_below(run_dir))
+    before = set(run_dir.rglob("*"))
     missing = [folder for folder in (run_dir, *run_dir.parents) if not folder.exists()]
     with hold(run_dir, names):
         try:
@@ -96,8 +96,8 @@ def hold_run(
         except Exception:
             ours = {run_dir / name for name in ("config.yaml", "versions.json")}
             ours |= {run_dir / ".locks" / f"{name}.{end}" for name in names for end in ENDS}
-            new = set(_below(run_dir)) - before
-            # Anything else was done here, or is another process's.
+            new = set(run_dir.rglob("*")) - before
+            # Any other file is a result, or another process wrote it.
             if {path for path in new if not path.is_dir()} <= ours:
                 _remove(new, missing)
             raise
@@ -106,12 +106,8 @@ def hold_run(
 ENDS = ("lock", "json")
 
 
-def _below(folder: Path) -> Iterator[Path]:
-    return folder.rglob("*")
-
-
 def _remove(paths: set[Path], folders: Sequence[Path]) -> None:
-    """Removes files, then folders from the innermost on as far as they are empty."""
+    """Removes files, then empty folders from the innermost outwards."""
     with contextlib.suppress(OSError):
         for path in sorted(paths, key=lambda path: len(path.parts), reverse=True):
             path.rmdir() if path.is_dir() else path.unlink()
@@ -123,5 +119,5 @@ def _owner(path: Path) -> tuple[str, str]:
     try:
         owner = json.loads(path.read_text(encoding="utf-8"))
         return str(owner["process"]), str(owner["host"])
-    except (OSError, ValueError, KeyError, TypeError):  # it has only just taken the lock
+    except (OSError, ValueError, KeyError, TypeError):  # locked, and the file not yet written
         return "unknown", "an unknown host"

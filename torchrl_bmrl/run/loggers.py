@@ -1,4 +1,4 @@
-"""TorchRL's loggers for a run folder: their failures never end a run."""
+"""TorchRL's loggers for a run folder; a logger that fails never ends a run."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ LOGGERS = ("csv", "wandb", "tensorboard", "none")
 
 
 def make_logger(kind: str, run_dir: Path, name: str, step: int = 0) -> Any:
-    """One of TorchRL's loggers, writing under ``run_dir/logs``.
+    """Returns one of TorchRL's loggers, which writes under ``run_dir/logs``.
 
-    A logger that cannot be made, say because its server cannot be reached, is reported on stderr
-    and replaced by the one that writes CSV files.
+    If a logger cannot be created, for example without a connection to its server, a warning is
+    logged and the CSV logger is used instead.
 
     Args:
         kind: ``"csv"``, ``"wandb"``, ``"tensorboard"`` or ``"none"``.
         run_dir: the run folder.
-        name: of the experiment, such as ``"bcq_lift"``.
-        step: that the run goes on from. CSV rows after it are dropped: they come again.
+        name: name of the experiment, such as ``"bcq_lift"``.
+        step: step that training continues from; later CSV rows are removed.
 
     Returns:
-        a :class:`torchrl.record.loggers.Logger`, or ``None`` for ``"none"``. Weights & Biases runs
-        offline where no account is configured, unless ``WANDB_MODE`` says otherwise. Every name of
-        a run folder is a run of its own there, which a run that goes on continues.
+        a :class:`torchrl.record.loggers.Logger`, or ``None`` for ``"none"``. Weights & Biases is
+        offline if no account is configured and ``WANDB_MODE`` is not set. There, every name in a
+        run folder has its own run, which a continued run appends to.
 
     Raises:
         UnknownNameError: for another kind.
@@ -59,9 +59,11 @@ def make_logger(kind: str, run_dir: Path, name: str, step: int = 0) -> Any:
         try:
             options = {"wandb_kwargs": _wandb_options(run_dir, name)} if kind == "wandb" else {}
             return get_logger(kind, str(folder), name, **options)
-        except Exception as error:  # whatever a server or its library may come up with
+        except Exception as error:  # servers and their libraries raise errors of any type
             reason = _first_line(error)
-            log.warning(f"{name}: no {kind} ({reason}); metrics go to CSV files in {folder}")
+            log.warning(
+                f"{name}: {kind} is not available ({reason}); metrics go to CSV files in {folder}"
+            )
     for path in (folder / name / "scalars").glob("*.csv"):
         rows = path.read_text(encoding="utf-8").splitlines(keepends=True)
         kept = [row for row in rows if row.endswith("\n") and _step(row) <= step]
@@ -80,35 +82,35 @@ def _wandb_options(run_dir: Path, name: str) -> dict[str, Any]:
         "project": "torchrl_bmrl",
         "dir": str(run_dir),
         "id": _wandb_id(run_dir / "logs" / name / "wandb_id"),
-        # Else wandb gives every logger of a process the run of the first one.
+        # By default wandb uses the process's first run for every logger.
         "reinit": "create_new",
     }
 
 
 def _wandb_id(path: Path) -> str:
-    """Of the run that a logger began or goes on with; kept beside its metrics."""
+    """Returns the id of a logger's wandb run, which is stored beside its metrics."""
     known = path.read_text(encoding="utf-8", errors="replace").strip() if path.is_file() else ""
-    if not re.fullmatch("[0-9a-f]{16}", known):  # wandb makes a folder of it
+    if not re.fullmatch("[0-9a-f]{16}", known):  # wandb names a folder after it
         known = uuid.uuid4().hex[:16]
         write_atomic(path, known + "\n")
     return known
 
 
 def _step(row: str) -> float:
-    """Of a row of TorchRL's CSV logger; that of a damaged one is beyond all others."""
+    """Returns the step of a row of TorchRL's CSV logger; infinity for a damaged row."""
     number = row.partition(",")[0]
     return int(number) if number.isdecimal() else math.inf
 
 
 def log_metrics(logger: Any, metrics: Mapping[str, Any], step: int) -> None:
-    """Logs scalars under their names; does nothing without a logger.
+    """Logs scalars under their names.
 
-    A logger that fails is reported on stderr, once, and not used again.
+    A logger that fails causes one warning and is not used again.
 
     Args:
-        logger: of :func:`make_logger`; ``None`` for none.
+        logger: from :func:`make_logger`; ``None`` logs nothing.
         metrics: numbers, or tensors of one number, by name.
-        step: that they belong to.
+        step: step of the metrics.
 
     Example:
         >>> import tempfile
@@ -125,16 +127,16 @@ def log_metrics(logger: Any, metrics: Mapping[str, Any], step: int) -> None:
             logger.log_scalar(name, float(value), step=step)
     except Exception as error:
         _lost.add(logger)
-        log.warning(f"metrics are logged no more, from step {step} on ({_first_line(error)})")
+        log.warning(f"metrics from step {step} on are not logged ({_first_line(error)})")
 
 
 def close_logger(logger: Any) -> None:
-    """Ends a logger: what it holds is written, and a run of Weights & Biases is finished.
+    """Closes a logger: writes its last metrics, and finishes a run of Weights & Biases.
 
-    One that fails is reported on stderr; nothing depends on it.
+    If this fails, a warning is logged.
 
     Args:
-        logger: of :func:`make_logger`; ``None`` for none.
+        logger: from :func:`make_logger`, or ``None``.
 
     Example:
         >>> import tempfile
@@ -146,7 +148,7 @@ def close_logger(logger: Any) -> None:
     try:
         logger.close()
     except Exception as error:
-        log.warning(f"the end of the metrics may be missing ({_first_line(error)})")
+        log.warning(f"the last metrics may be missing ({_first_line(error)})")
 
 
 _lost: WeakSet[Any] = WeakSet()

@@ -1,7 +1,7 @@
-"""Log messages on stderr, for commands; programs that use the library route the logger themselves.
+"""Log messages on stderr, for commands; other programs configure the logger themselves.
 
 Every module logs under the name ``torchrl_bmrl``. Worker processes send their records to the
-process that started them, so one handler there sees everything.
+process that started them, so one handler there receives all of them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def write_line(message: str) -> None:
     A closed or broken stderr is ignored: it must not end a run.
 
     Args:
-        message: the line without its newline; several lines stay together.
+        message: the line without its newline, or several lines.
 
     Example:
         >>> write_line("update 2000 saved")

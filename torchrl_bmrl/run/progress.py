@@ -1,4 +1,4 @@
-"""How far a long loop is: a bar on a terminal, plain lines in a log."""
+"""Progress of long loops: a bar on a terminal, plain lines in a log file."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ with needs("recipes"):
     from tqdm import tqdm
 
 SOON = 5.0
-"""Seconds after which the first line is printed; what is done by then says nothing."""
+"""Seconds until the first line; a shorter loop prints nothing."""
 INTERVAL = 50.0
-"""Seconds between two lines, so that no minute is without one."""
+"""Seconds between two lines, so that there is one in every minute."""
 WINDOW = 6
-"""Lines whose time the rate is taken over: what was read back at the start is soon out of it."""
+"""Lines that the rate is averaged over; results loaded at the start soon no longer count."""
 
 
-_whose = ""
+_prefix = ""
 
 
 def name_lines(whose: str) -> None:
-    """Has lines, from now on, begin with a name: those of several runs may share a log.
+    """Sets a prefix for all progress lines of this process: several runs may share a log.
 
     Args:
-        whose: of what goes on in this process.
+        whose: the prefix; ``""`` for none.
 
     Example:
         >>> name_lines("runs/mine")
@@ -38,31 +38,31 @@ def name_lines(whose: str) -> None:
         'runs/mine: training: 0 of 200 updates (0%), none in the last 0:00:10'
         >>> name_lines("")
     """
-    global _whose
-    _whose = f"{whose}: " if whose else ""
+    global _prefix
+    _prefix = f"{whose}: " if whose else ""
 
 
 class Progress(Protocol):
-    """What a loop counts on, a bar or lines."""
+    """A progress bar, or :class:`Lines`."""
 
     n: float
 
     def update(self, n: float = 1) -> Any:
-        """Counts units that are done, or, below 0, to be done again."""
+        """Adds finished units; a negative number takes back those of a job that is retried."""
 
 
 def progress(
     total: int | None, description: str, unit: str, **bar: Any
 ) -> AbstractContextManager[Progress]:
-    """Shows how far a loop is, on stderr: a bar where that is a terminal, else plain lines.
+    """Shows the progress of a loop on stderr: as a bar on a terminal, else as plain lines.
 
-    The first line comes after :data:`SOON` seconds, the others every :data:`INTERVAL` seconds, from
-    a thread of their own, whatever the loop does meanwhile; a last one says how long it took.
+    A thread prints the first line after :data:`SOON` seconds and the others every :data:`INTERVAL`
+    seconds. The last line contains the duration.
 
     Args:
-        total: units in all; ``None`` where nobody knows.
-        description: what the loop does.
-        unit: what it counts, in the singular.
+        total: number of units; ``None`` if it is unknown.
+        description: name of the loop, such as ``"training"``.
+        unit: name of a unit, in the singular.
         **bar: further options of the bar, such as ``leave``.
 
     Example:
@@ -78,12 +78,7 @@ def progress(
 
 
 class Lines:
-    """Progress as lines that a log file can hold; see :func:`progress`.
-
-    Args:
-        total: units in all, or ``None``.
-        description: what is done.
-        unit: what is counted, in the singular.
+    """Progress as plain lines, for log files; the arguments are those of :func:`progress`.
 
     Example:
         >>> lines = Lines(200, "training", "update")
@@ -97,7 +92,7 @@ class Lines:
         self.total, self.description, self.unit = total, description, unit
         self.n: float = 0
         self.started = time.monotonic()
-        self.said: deque[tuple[float, float]] = deque([(self.started, 0)], maxlen=WINDOW)
+        self.printed: deque[tuple[float, float]] = deque([(self.started, 0)], maxlen=WINDOW)
         self.ended = threading.Event()
         self.thread = threading.Thread(target=self._print, daemon=True)
 
@@ -108,19 +103,19 @@ class Lines:
     def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
         self.ended.set()
         self.thread.join()
-        if kind is None and len(self.said) > 1:
+        if kind is None and len(self.printed) > 1:
             seconds = time.monotonic() - self.started
             write_line(f"{self._where()}, done in {_duration(seconds)}")
 
     def update(self, n: float = 1) -> None:
-        """Counts units that are done, or, below 0, to be done again."""
+        """Adds finished units; a negative number takes units back."""
         self.n += n
 
     def line(self, now: float) -> str:
-        """What is printed at a moment of ``time.monotonic()``."""
-        before, done = self.said[0]
+        """Returns the line for a time of ``time.monotonic()``."""
+        before, done = self.printed[0]
         rate = (self.n - done) / max(now - before, 1e-9)
-        self.said.append((now, self.n))
+        self.printed.append((now, self.n))
         if rate <= 0:
             return f"{self._where()}, none in the last {_duration(now - before)}"
         parts = [self._where(), self._speed(rate)]
@@ -135,7 +130,7 @@ class Lines:
         where += f" {self.unit}s"
         if self.total:
             where += f" ({self.n / self.total:.0%})"
-        return f"{_whose}{self.description}: {where}"
+        return f"{_prefix}{self.description}: {where}"
 
     def _speed(self, rate: float) -> str:
         per = "s" if rate >= 1 else "min" if rate >= 1 / 60 else "h"

@@ -1,4 +1,4 @@
-"""Settings as dataclasses whose fields state what is valid, and the check of both."""
+"""Settings as dataclasses whose fields declare their valid values, and the check of them."""
 
 from __future__ import annotations
 
@@ -19,18 +19,17 @@ def setting(
     choices: Sequence[Any] = (),
     unique: bool = False,
 ) -> Any:
-    """A field of a settings dataclass together with what is valid for it.
+    """Declares a field of a settings dataclass and its valid values.
 
-    In a list or mapping the limits hold for each value. ``None`` is valid wherever the type
-    allows it.
+    The limits apply to each value of a list or mapping. ``None`` is valid where the type allows it.
 
     Args:
         default: the default; lists and dicts are copied for each object.
-        above: values must be larger.
-        at_least: values must not be smaller.
-        at_most: values must not be larger.
+        above: exclusive lower limit.
+        at_least: lower limit.
+        at_most: upper limit.
         choices: the valid values.
-        unique: a list must not be empty and must hold each value once.
+        unique: whether a list must not be empty and must contain each value once.
 
     Example:
         >>> @dataclasses.dataclass
@@ -54,15 +53,15 @@ def setting(
 
 
 def check_settings(settings: Any, prefix: str = "") -> None:
-    """Compares every field of a settings dataclass, and of those in it, with what is valid.
+    """Checks every field of a settings dataclass and of the dataclasses in it.
 
     Args:
         settings: the object.
-        prefix: of the names in messages, such as ``"bcq."``.
+        prefix: prefix of the names in messages, such as ``"bcq."``.
 
     Raises:
         UnknownNameError: for a value that is none of the choices.
-        ConfigError: naming the field, its value and what is valid.
+        ConfigError: naming the field, its value and the valid values.
 
     Example:
         >>> @dataclasses.dataclass
@@ -89,7 +88,7 @@ def _check(name: str, value: Any, valid: Mapping[str, Any]) -> None:
 
 
 def _items(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """The values of a setting, each with its name."""
+    """Yields the values of a setting, each with its name."""
     if isinstance(value, Mapping):
         yield from ((f"{name}.{key}", item) for key, item in value.items())
     elif isinstance(value, list | tuple):

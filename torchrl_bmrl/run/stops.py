@@ -1,4 +1,4 @@
-"""Runs that are asked to stop do so between two units of work, with what they did kept."""
+"""Stops a run between two units of work after a signal, so that finished work is saved."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _asked: signal.Signals | None = None
 
 
 def note_signal(number: int, frame: FrameType | None = None) -> None:
-    """A signal's handler: the next :func:`check_stop` raises, and a second signal at once.
+    """Signal handler: the next :func:`check_stop` raises; a second signal raises at once.
 
     Raises:
         KeyboardInterrupt: at the second signal.
@@ -26,19 +26,19 @@ def note_signal(number: int, frame: FrameType | None = None) -> None:
 
 
 def check_stop() -> None:
-    """Called between two units of work.
+    """Raises an error if a signal was received; called between two units of work.
 
     Raises:
-        StoppedError: if the process was asked to stop.
+        StoppedError: if a signal was received.
 
     Example:
         >>> with stop_on_signals():
-        ...     signal.raise_signal(signal.SIGTERM)  # noted, and what goes on is finished
+        ...     signal.raise_signal(signal.SIGTERM)  # the current unit of work is finished
         ...     try:
         ...         check_stop()
         ...     except StoppedError as stop:
         ...         print(stop)
-        stopped by SIGTERM; what was done is kept, the same command goes on
+        stopped by SIGTERM; finished work is saved, the same command continues it
     """
     if _asked is not None:
         raise StoppedError(_asked)
@@ -46,9 +46,9 @@ def check_stop() -> None:
 
 @contextmanager
 def stop_on_signals() -> Iterator[None]:
-    """Has Ctrl-C, SIGTERM and SIGHUP stop the work at its next :func:`check_stop`.
+    """Makes Ctrl-C, SIGTERM and SIGHUP stop the block at its next :func:`check_stop`.
 
-    Only in a process's main thread, which alone may handle signals; elsewhere nothing changes.
+    Does nothing outside the main thread, since only that thread may handle signals.
 
     Example:
         >>> with stop_on_signals():
@@ -60,7 +60,7 @@ def stop_on_signals() -> Iterator[None]:
         return
     numbers = [signal.SIGINT, signal.SIGTERM]
     numbers += [signal.SIGHUP] if hasattr(signal, "SIGHUP") else []
-    # One that is ignored stays so: nohup, and a shell's background jobs.
+    # Ignored signals stay ignored: nohup and background jobs of a shell ignore some.
     numbers = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
     before = {number: signal.signal(number, note_signal) for number in numbers}
     _asked = None

@@ -1,4 +1,4 @@
-"""Jobs over worker processes, and one account of how far they are."""
+"""Runs jobs in worker processes, with one progress bar for all of them."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ Result = TypeVar("Result")
 Report = Callable[[int], None]
 """Called by a job with the number of units that it has finished since its last call.
 
-It raises :class:`~torchrl_bmrl.errors.StoppedError` when the run was asked to stop: a job that has
-more than its last checkpoint catches it, keeps what it has and raises it again.
+It raises :class:`~torchrl_bmrl.errors.StoppedError` when the run is stopped. A job with unsaved
+work catches that error, saves the work and raises it again.
 """
 
 TRIES = 3
-"""So often is a job begun whose worker dies."""
+"""How often a job is started before the run fails, if its worker dies each time."""
 SILENCE = 900.0
-"""Seconds without a word after which a worker is taken to hang. Compiling takes one of minutes."""
+"""Seconds without a report after which a worker counts as hung; compiling can take minutes."""
 GRACE = 60.0
-"""Seconds that workers have to keep what they did when a run stops."""
+"""Seconds that workers have to save their work when a run stops."""
 
 
 def available_cores() -> int:
-    """Cores that this process may use.
+    """Returns the number of cores that this process may use.
 
     Example:
         >>> available_cores() >= 1
@@ -68,27 +68,27 @@ def run_jobs(
 ) -> list[Result]:
     """Calls ``function(job, report)`` for every job and returns the results in the jobs' order.
 
-    With more than one worker the jobs run in freshly spawned processes, so ``function`` and the
-    jobs must be importable by name. Every job runs on one thread, whatever the number of workers.
+    With more than one worker the jobs run in new processes, so ``function`` and the jobs must be
+    importable by name. Every job uses one thread. Log records of workers reach this process.
 
-    A worker that dies (killed for memory, say), or says nothing for :data:`SILENCE` seconds and so
-    is killed, is reported and replaced, and its job done again: a job must be one that can be, from
-    the start or from what it kept. What runs here, with one worker, is not watched.
+    If a worker dies, for example for lack of memory, a warning is logged and another worker runs
+    the job again, from its start or its last checkpoint. A worker that reports nothing for
+    :data:`SILENCE` seconds is killed first. With one worker nothing of this is done.
 
-    After a signal (:func:`~torchrl_bmrl.run.stops.stop_on_signals`) every job stops at its next
-    report. The same happens to the other jobs when one fails. Workers send their log records here.
+    After a signal (:func:`~torchrl_bmrl.run.stops.stop_on_signals`), or when another job fails,
+    every job stops at its next report.
 
     Args:
-        function: what to do with a job; it calls ``report(n)`` as it advances.
-        jobs: its arguments.
-        workers: processes; 1 runs everything here.
-        total: units over all jobs, for the time left (:func:`~torchrl_bmrl.run.progress.progress`).
-        description: what the jobs do.
-        unit: what they count, in the singular.
+        function: runs one job and calls ``report(n)`` as it advances.
+        jobs: the arguments of ``function``.
+        workers: number of processes; with 1 everything runs in this process.
+        total: units of all jobs, for the progress (:func:`~torchrl_bmrl.run.progress.progress`).
+        description: name of the jobs, such as ``"training"``.
+        unit: name of a unit, in the singular.
 
     Raises:
         BMRLError: if a job's workers die three times.
-        StoppedError: if the run was asked to stop.
+        StoppedError: if the run is stopped.
 
     Example:
         >>> run_jobs(
@@ -130,7 +130,7 @@ def _one_thread_each() -> Iterator[None]:
 
 
 class _Worker:
-    """A process, and the job that it is at."""
+    """A worker process and its current job."""
 
     def __init__(self, function: Callable[[Job, Report], Result]) -> None:
         context = multiprocessing.get_context("spawn")
@@ -139,26 +139,26 @@ class _Worker:
         self.process = context.Process(target=_serve, args=(theirs, function, level), daemon=True)
         self.process.start()
         theirs.close()  # so that the process's end closes the pipe
-        self.job = -1  # its number
-        self.units = 0  # that the job has reported
-        self.heard = time.monotonic()
+        self.job = -1  # number of the job
+        self.units = 0  # units that the job has reported
+        self.last_message = time.monotonic()
         self.hangs = False
 
     def begin(self, number: int, job: Any) -> None:
-        self.job, self.units, self.heard = number, 0, time.monotonic()
+        self.job, self.units, self.last_message = number, 0, time.monotonic()
         self._send(("job", job))
 
     def end(self) -> None:
-        """Asks it to end: at its job's next report, or where it waits for a job."""
+        """Stops the worker at its job's next report, or at once if it waits for a job."""
         self.process.terminate()
         self._send(("end", None))
 
     def _send(self, message: tuple[str, Any]) -> None:
-        with suppress(OSError):  # if it is dead already, its connection says so next
+        with suppress(OSError):  # a dead worker is noticed when its connection is read
             self.connection.send(message)
 
     def kill_if_it_hangs(self) -> None:
-        if time.monotonic() - self.heard > SILENCE:
+        if time.monotonic() - self.last_message > SILENCE:
             self.hangs = True
             self.process.kill()
 
@@ -176,14 +176,14 @@ class _SendRecords(logging.handlers.QueueHandler):
 
 
 def _serve(connection: Connection, function: Callable[[Job, Report], Result], level: int) -> None:
-    """A worker's life: jobs in, reports and results out."""
+    """Main loop of a worker: receives jobs, sends reports and results."""
     LOGGER.setLevel(level)
     LOGGER.handlers, LOGGER.propagate = [_SendRecords(connection)], False
     torch.set_num_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     signal.signal(signal.SIGTERM, note_signal)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    gc.freeze()  # imported modules stay; robosuite would search them at every env.close()
+    gc.freeze()  # robosuite collects garbage at every env.close(): leave imported modules out
 
     def report(units: int) -> None:
         connection.send(("report", units))
@@ -205,7 +205,7 @@ def _serve(connection: Connection, function: Callable[[Job, Report], Result], le
 
 
 def _end_with_parent() -> None:
-    # A worker that outlives a killed run would write into the folder of the run that goes on.
+    # A worker that outlives a killed run would write into the folder of the continued run.
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
@@ -234,7 +234,7 @@ def _run_in_processes(
                 worker.kill_if_it_hangs()
             for connection in ready:
                 worker = by_connection[connection]
-                number, worker.heard = worker.job, time.monotonic()
+                number, worker.last_message = worker.job, time.monotonic()
                 try:
                     kind, value = worker.connection.recv()
                 except (EOFError, OSError):
@@ -249,15 +249,15 @@ def _run_in_processes(
                     raise error from RemoteTraceback(text)
                 elif kind == "death":
                     pool.remove(worker)
-                    bar.update(-worker.units)  # to be reported anew
+                    bar.update(-worker.units)  # the retried job reports them again
                     deaths[number] += 1
                     what = f"{description}: a worker {value} in job {number + 1} of {len(jobs)}"
                     if deaths[number] == TRIES:
                         raise BMRLError(
-                            f"{what}, the {TRIES}rd time; what was finished is kept, the same "
-                            "command goes on"
+                            f"{what} for the {TRIES}rd time; finished work is saved, the same "
+                            "command continues it"
                         )
-                    log.warning(f"{what}; the job is done again")
+                    log.warning(f"{what}; the job is retried")
                     waiting.appendleft(number)
                 else:
                     results[number] = value
@@ -270,7 +270,7 @@ def _run_in_processes(
         return [results[number] for number in range(len(jobs))]
     finally:
         for worker in pool:
-            worker.end()  # it keeps what it did
+            worker.end()
         end = time.monotonic() + GRACE
         for worker in pool:
             worker.process.join(max(0.0, end - time.monotonic()))
@@ -281,17 +281,19 @@ def _run_in_processes(
 def _death(worker: _Worker) -> str:
     worker.process.join()
     if worker.hangs:
-        return f"said nothing for {SILENCE:.0f} s and was killed"
+        return f"reported nothing for {SILENCE:.0f} s and was killed"
     code = worker.process.exitcode or 0
-    return f"was killed by signal {-code} (out of memory?)" if code < 0 else f"ended, code {code},"
+    if code < 0:
+        return f"was killed by signal {-code} (out of memory?)"
+    return f"ended with code {code}"
 
 
 def derive_seed(seed: int, *names: str | int) -> int:
-    """A 32-bit seed for one purpose: other names, other stream.
+    """Derives a 32-bit seed for one purpose; other names give an independent stream.
 
     Args:
-        seed: of the whole, such as a run.
-        *names: of the purpose, such as ``"collect", "lift", 3``.
+        seed: the seed of the run.
+        *names: the purpose, such as ``"collect", "lift", 3``.
 
     Returns:
         a number in [0, 2³²), the same on every machine.

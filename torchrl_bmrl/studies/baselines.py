@@ -40,7 +40,7 @@ from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
 from torchrl_bmrl.run.settings import setting
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.studies.algorithms import ALGORITHMS, OBJECTIVES, objectives
-from torchrl_bmrl.training.checkpoint import keep_training, resume_training
+from torchrl_bmrl.training.checkpoint import resume_training, save_training
 from torchrl_bmrl.training.fit import Every, fit
 from torchrl_bmrl.training.health import check_metrics
 from torchrl_bmrl.training.update import gradient_step, keep_freed_memory, make_adam
@@ -202,7 +202,7 @@ class Learner:
         settings = self.run.settings
         metadata = {"kind": "baseline", "name": self.name, "updates": update}
         metadata |= {"settings": settings.deciding()}
-        keep_training(
+        save_training(
             self.path,
             self.loss,
             self.optimizers,

@@ -1,4 +1,4 @@
-"""What trains: one update as a piece that can be compiled or captured, and its optimizer."""
+"""Training: updates that can be compiled or captured as a CUDA graph, and their optimizer."""
 
 from torchrl_bmrl.training.update import (
     Metrics,

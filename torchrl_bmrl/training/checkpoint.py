@@ -1,4 +1,4 @@
-"""Checkpoints: one safetensors file each, written whole or not at all, read without pickle."""
+"""Checkpoints: one safetensors file each, written atomically and read without pickle."""
 
 from __future__ import annotations
 
@@ -38,18 +38,18 @@ Metadata = dict[str, Any]
 def save_checkpoint(
     path: Path, state: Mapping[str, Any], metadata: Mapping[str, Any], *, keep: int = 1
 ) -> None:
-    """Saves nested state dicts and what is needed to build what they belong to.
+    """Saves nested state dicts and a description of the networks that they belong to.
 
-    The file also holds a checksum of everything in it and, under ``metadata["versions"]`` unless
-    there is such an entry, the versions of what wrote it.
+    The file also contains a checksum and, unless ``metadata`` has an entry ``"versions"``, the
+    versions of this library, torch, tensordict and torchrl.
 
     Args:
         path: the file.
         state: nested dicts and lists of tensors and plain values, such as ``state_dict()`` of
             modules and optimizers.
-        metadata: JSON-compatible description, read back by :func:`load_checkpoint`.
-        keep: checkpoints to keep, this one and those before it: ``a.safetensors`` is the newest,
-            ``a.1.safetensors`` the one before.
+        metadata: JSON-compatible description, returned by :func:`load_checkpoint`.
+        keep: number of checkpoints to keep: ``a.safetensors`` is the newest, ``a.1.safetensors``
+            the one before.
 
     Example:
         >>> import tempfile
@@ -61,20 +61,20 @@ def save_checkpoint(
     path, tensors = Path(path), dict[str, Tensor]()
     header = {"state": _encode(state, "", tensors), "metadata": {"versions": _VERSIONS, **metadata}}
     header[_SUM] = _checksum(header, tensors)
-    # One entry: safetensors orders several at random, and equal runs would differ in bytes.
+    # One entry: safetensors writes several in random order, and equal runs would differ in bytes.
     data = safetensors.torch.save(tensors, {_HEADER: json.dumps(header)})
     if keep > 1 and path.exists():
         for number in range(keep - 1, 1, -1):
             if (newer := earlier(path, number - 1)).exists():
                 newer.replace(earlier(path, number))
-        # A second name: killed at any moment, the newest one is there.
+        # A link, so that the newest checkpoint exists at any moment.
         earlier(path, 1).unlink(missing_ok=True)
         link_or_copy(path, earlier(path, 1))
     write_atomic(path, data)
 
 
 def earlier(path: Path, number: int) -> Path:
-    """Where the checkpoint is kept that came so many before the newest.
+    """Returns the path of an earlier checkpoint; number 1 is the one before the newest.
 
     Example:
         >>> earlier(Path("run/checkpoint.safetensors"), 1).name
@@ -92,15 +92,15 @@ _VERSIONS = {
 
 
 def _checksum(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> str:
-    """Of all that a checkpoint holds but its checksum."""
-    said = json.dumps({key: value for key, value in header.items() if key != _SUM})
-    digest = hashlib.sha256(said.encode())
+    """Checksum of everything in a checkpoint except the checksum itself."""
+    text = json.dumps({key: value for key, value in header.items() if key != _SUM})
+    digest = hashlib.sha256(text.encode())
     digest.update(safetensors.torch.save(dict(tensors)))
     return digest.hexdigest()
 
 
 def load_checkpoint(path: Path, *, kind: str) -> tuple[State, Metadata]:
-    """Reads what :func:`save_checkpoint` wrote.
+    """Loads a checkpoint of :func:`save_checkpoint`.
 
     Args:
         path: the file.
@@ -125,20 +125,20 @@ def load_checkpoint(path: Path, *, kind: str) -> tuple[State, Metadata]:
 
 
 def load_newest(path: Path, *, kind: str) -> tuple[State, Metadata] | None:
-    """What training goes on from: the newest checkpoint, or the one before if that is damaged.
+    """Loads the newest checkpoint, or the one before if that is damaged.
 
-    A damaged checkpoint is reported on stderr and set aside as ``a.damaged.safetensors``, and the
-    one that is used becomes the newest.
+    A damaged checkpoint causes a warning and is renamed to ``a.damaged.safetensors``; the one that
+    is loaded becomes the newest.
 
     Args:
         path: the newest checkpoint.
         kind: expected ``metadata["kind"]``.
 
     Returns:
-        state and metadata; ``None`` if nothing was kept.
+        state and metadata; ``None`` if there is no checkpoint.
 
     Raises:
-        CheckpointError: if all that were kept are damaged, or of another kind; what was kept stays.
+        CheckpointError: if all checkpoints are damaged, or of another kind; no file changes then.
 
     Example:
         >>> import tempfile
@@ -167,7 +167,7 @@ def load_newest(path: Path, *, kind: str) -> tuple[State, Metadata] | None:
             continue
         _of_kind(file, metadata, kind)
         if damaged:
-            log.warning(f"{damaged[0]}; going on from {file.name}")
+            log.warning(f"{damaged[0]}; training continues from {file.name}")
             for bad in damaged:
                 os.replace(bad.path, path.with_name(f"{path.stem}.damaged{path.suffix}"))
         if file != path:
@@ -186,10 +186,10 @@ def _read(path: Path) -> tuple[State, Metadata]:
             header = json.loads((file.metadata() or {})[_HEADER])
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
         if header[_SUM] != _checksum(header, tensors):
-            raise ValueError("its checksum differs")
+            raise ValueError("the checksum differs")
         state, metadata = _decode(header["state"], tensors), header["metadata"]
         if not isinstance(state, dict) or not isinstance(metadata, dict):
-            raise ValueError("its state and what it says of it are no mappings")
+            raise ValueError("state and metadata are not mappings")
         return state, metadata
     except (
         safetensors.SafetensorError,
@@ -202,7 +202,7 @@ def _read(path: Path) -> tuple[State, Metadata]:
     ) as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else error
         raise CheckpointError(
-            path, f"not a whole checkpoint of this library in safetensors format ({reason})"
+            path, f"not a complete safetensors checkpoint of this library ({reason})"
         ) from error
 
 
@@ -213,15 +213,15 @@ def _of_kind(path: Path, metadata: Metadata, kind: str) -> Metadata:
 
 
 def load_state(module: nn.Module, state: Mapping[str, Tensor], path: Path) -> None:
-    """Loads a module's state and names the first key or shape that does not fit.
+    """Loads a ``state_dict()`` into a module.
 
     Args:
-        module: takes it over.
-        state: parameters and buffers by name, as ``state_dict()`` gives them.
-        path: of the checkpoint that it is from, for the message.
+        module: the module.
+        state: parameters and buffers by name.
+        path: path of the checkpoint, for the message.
 
     Raises:
-        CheckpointError: if keys or shapes differ; nothing is loaded.
+        CheckpointError: naming the first key or shape that differs; nothing is loaded then.
 
     Example:
         >>> module, path = nn.Linear(2, 1), Path("a.safetensors")
@@ -233,7 +233,7 @@ def load_state(module: nn.Module, state: Mapping[str, Tensor], path: Path) -> No
     """
     own = module.state_dict()
     if not isinstance(state, Mapping):
-        raise CheckpointError(path, f"holds {type(state).__name__}; valid: parameters by name")
+        raise CheckpointError(path, f"contains {type(state).__name__}; valid: parameters by name")
     for key in [*own, *state]:
         if key not in state or key not in own:
             where = "checkpoint" if key not in state else "networks"
@@ -253,22 +253,22 @@ Built = TypeVar("Built", bound=nn.Module)
 
 
 def build(make: Callable[..., Built], options: Any, state: Mapping[str, Any], path: Path) -> Built:
-    """Networks as a checkpoint says that they are, with its parameters, not to be trained.
+    """Builds the frozen networks of a checkpoint.
 
     Args:
-        make: makes the networks of the options.
-        options: its keyword arguments, as the checkpoint's metadata have them.
-        state: of the checkpoint, the parameters under ``module``.
-        path: of the checkpoint, for the message.
+        make: builds the networks.
+        options: keyword arguments of ``make``, from the checkpoint's metadata.
+        state: state of the checkpoint, with the parameters under ``module``.
+        path: path of the checkpoint, for the message.
 
     Raises:
-        CheckpointError: if the options are none of ``make``, or do not belong to the parameters, or
-            these are not finite.
+        CheckpointError: if ``make`` refuses the options, or the parameters do not fit the networks
+            or are not finite.
     """
     params = state.get("module")
     if not isinstance(options, dict) or not isinstance(params, dict):
-        raise CheckpointError(path, "says nothing of its networks; valid: a trained module")
-    # Whoever wrote the file decides how much memory the networks take: no more than what is in it.
+        raise CheckpointError(path, "contains no networks; valid: the checkpoint of a module")
+    # The file decides how much memory the networks take: no size may exceed those of its tensors.
     tensors = [value for value in params.values() if isinstance(value, Tensor)]
     largest = max((size for tensor in tensors for size in tensor.shape), default=0)
     for name, option in options.items():
@@ -279,15 +279,15 @@ def build(make: Callable[..., Built], options: Any, state: Mapping[str, Any], pa
     try:
         module = make(**options)
     except (AttributeError, RuntimeError, TypeError, ValueError) as error:
-        raise CheckpointError(path, f"not the settings of networks ({error})") from error
+        raise CheckpointError(path, f"its options build no networks ({error})") from error
     load_state(module, params, path)
     for key, tensor in params.items():
         if not tensor.isfinite().all():
-            raise CheckpointError(path, f"{key!r} holds numbers that are not finite")
+            raise CheckpointError(path, f"{key!r} contains numbers that are not finite")
     return module.requires_grad_(False)
 
 
-def keep_training(
+def save_training(
     path: Path,
     module: nn.Module,
     optimizers: Mapping[str, Adam],
@@ -296,15 +296,15 @@ def keep_training(
     device: str,
     keep: int,
 ) -> None:
-    """Saves what a training goes on from: parameters, optimizers, and random numbers.
+    """Saves the state of a training: parameters, optimizers, and random number generators.
 
     Args:
-        path: of the newest checkpoint.
-        module: what is trained.
-        optimizers: its optimizers by name.
-        metadata: of :func:`save_checkpoint`, with ``updates``.
-        device: that trains.
-        keep: checkpoints to keep, this one and those before it.
+        path: path of the newest checkpoint.
+        module: the networks.
+        optimizers: their optimizers by name.
+        metadata: metadata for :func:`save_checkpoint`, with ``updates``.
+        device: device of the training.
+        keep: number of checkpoints to keep.
     """
     state = {
         "module": module.state_dict(),
@@ -322,20 +322,20 @@ def resume_training(
     kind: str,
     device: str,
 ) -> dict[str, Any] | None:
-    """Goes on from what :func:`keep_training` saved, or from the one before if that is damaged.
+    """Restores the state of :func:`save_training` from the newest checkpoint that is not damaged.
 
     Args:
-        path: of the newest checkpoint.
-        module: takes over the parameters.
-        optimizers: take over their state.
+        path: path of the newest checkpoint.
+        module: the networks.
+        optimizers: their optimizers by name.
         kind: expected ``metadata["kind"]``.
-        device: that trains.
+        device: device of the training.
 
     Returns:
-        the metadata; ``None`` if nothing was kept.
+        the metadata; ``None`` if there is no checkpoint.
 
     Raises:
-        CheckpointError: if what was kept is damaged, or belongs to another training.
+        CheckpointError: if all checkpoints are damaged, or belong to another training.
 
     Example:
         >>> import tempfile
@@ -344,8 +344,8 @@ def resume_training(
         >>> net = nn.Linear(2, 1)
         >>> optimizers = {"net": make_adam(net.parameters(), lr=0.1)}
         >>> resume_training(path, net, optimizers, kind="example", device="cpu")
-        >>> said = {"kind": "example", "updates": 3}
-        >>> keep_training(path, net, optimizers, said, device="cpu", keep=2)
+        >>> metadata = {"kind": "example", "updates": 3}
+        >>> save_training(path, net, optimizers, metadata, device="cpu", keep=2)
         >>> resume_training(path, net, optimizers, kind="example", device="cpu")["updates"]
         3
     """
@@ -362,7 +362,7 @@ def resume_training(
     except CheckpointError:
         raise
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
-        raise CheckpointError(path, f"not what this training goes on from ({error})") from error
+        raise CheckpointError(path, f"not a checkpoint of this training ({error})") from error
     return metadata
 
 
@@ -381,7 +381,7 @@ def _encode(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
         return value
     if isinstance(value, torch.Size):
         return list(value)
-    raise TypeError(f"{name} is a {type(value).__name__}, which a checkpoint cannot hold")
+    raise TypeError(f"{name} is a {type(value).__name__}, which a checkpoint cannot contain")
 
 
 def _decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:

@@ -1,4 +1,4 @@
-"""The loop that trains everything: sample, update, check, log, save, stop."""
+"""The training loop of every stage and study: sample, update, check, log, save, stop."""
 
 from __future__ import annotations
 
@@ -45,20 +45,20 @@ def fit(
 ) -> None:
     """Trains from update ``start + 1`` to ``total``.
 
-    ``check`` runs before every ``save``, so that a diverged network is never saved. When the run is
-    asked to stop, the last update is checked and saved before this function ends.
+    ``check`` runs before every ``save``, so that a diverged network is never saved. If the run is
+    stopped, the last update is checked and saved first.
 
     Args:
         step: ``step(update, batch)`` changes the networks and returns metrics.
         sample: returns a batch.
         total: number of the last update.
         every: intervals.
-        check: ``check(update, metrics, batch, logging)`` raises an error for a training that went
-            wrong, and logs the metrics if ``logging``. Only here does the loop wait for the device.
+        check: ``check(update, metrics, batch, logging)`` raises an error if the training diverged,
+            and logs the metrics if ``logging``. The loop waits for the device only here.
         save: ``save(update)`` writes a checkpoint.
-        start: updates that are done already.
-        evaluate: ``evaluate(update)``, after each ``every.evaluate`` updates.
-        report: ``report(1)`` after each update, for progress; it may raise ``StoppedError``.
+        start: number of updates that are already done.
+        evaluate: ``evaluate(update)``, called every ``every.evaluate`` updates.
+        report: ``report(1)``, called after each update; it may raise ``StoppedError``.
 
     Raises:
         StoppedError: if ``report`` raised it; everything is saved then.

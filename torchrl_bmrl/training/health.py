@@ -1,4 +1,4 @@
-"""Training that goes wrong: found at the next logged update, and named with what may be the cause.
+"""Detects training that diverged or collapsed, and raises an error that names likely causes.
 
 Example:
     >>> check_metrics({"loss_qvalue": float("nan")}, "bcq lift, update 100")
@@ -18,29 +18,29 @@ from torch import Tensor
 from torchrl_bmrl.errors import BMRLError
 
 LARGEST = 1e8
-"""No loss or metric is as large in a training that goes well."""
+"""A loss or metric above this value means that the training has diverged."""
 EXPLODED = 5.0
-"""Values are no estimates any more beyond so many times what any policy can earn."""
+"""Values above this multiple of the largest possible return mean that the critic has diverged."""
 DEAD = 1e-5
-"""Proposals that differ by less are one action."""
+"""Proposals that differ by less than this count as one action."""
 SATURATED = 0.99
-"""Share of components at a bound, in proposals of a decoder that is stuck there."""
-_KEPT = "the last checkpoint is kept"
+"""Share of proposed action components at a bound above which the decoder is saturated."""
+_SAVED = "the last checkpoint stays"
 
 
 def value_limits(reward: Tensor, gamma: float) -> dict[str, float]:
-    """Bounds of a critic's metrics: :data:`EXPLODED` times the largest return that there can be.
+    """Returns bounds of a critic's metrics: :data:`EXPLODED` times the largest possible return.
 
     Args:
-        reward: of a batch.
-        gamma: discount factor; nothing bounds the returns of 1.
+        reward: rewards of a batch.
+        gamma: discount factor; with 1 there is no bound.
 
     Example:
         >>> import torch
         >>> value_limits(torch.tensor([0.0, 2.0]), gamma=0.5)
         {'pred_value': 20.0, 'next_state_value': 20.0}
     """
-    largest = max(1.0, reward.abs().max().item())  # a batch of a sparse reward may hold none
+    largest = max(1.0, reward.abs().max().item())  # a batch with sparse rewards may have none
     limit = EXPLODED * largest / (1 - gamma) if gamma < 1 else math.inf
     return {"pred_value": limit, "next_state_value": limit}
 
@@ -48,12 +48,12 @@ def value_limits(reward: Tensor, gamma: float) -> dict[str, float]:
 def check_metrics(
     metrics: Mapping[str, Any], where: str, limits: Mapping[str, float] | None = None
 ) -> None:
-    """Stops a run whose losses or values are not finite any more, or too large to be true.
+    """Raises an error if a loss or value is not finite or too large.
 
     Args:
         metrics: scalars by name.
-        where: what is trained, and its update.
-        limits: bounds on the absolute value of some; :data:`LARGEST` holds for the others.
+        where: the training and the update, for the message.
+        limits: bounds on the absolute value of some metrics; :data:`LARGEST` bounds the others.
 
     Raises:
         BMRLError: naming the first such metric.
@@ -62,51 +62,49 @@ def check_metrics(
         >>> check_metrics({"pred_value": 900.0}, "bcq lift, update 100", {"pred_value": 500.0})
         Traceback (most recent call last):
         ...
-        torchrl_bmrl.errors.BMRLError: bcq lift, update 100: pred_value is 900, beyond 500; ...
+        torchrl_bmrl.errors.BMRLError: bcq lift, update 100: pred_value is 900, above 500; ...
     """
     for name, value in metrics.items():
         number, limit = float(value), (limits or {}).get(name, LARGEST)
         if not math.isfinite(number):
-            raise BMRLError(f"{where}: {name} is {number}; {_KEPT}, a lower learning rate may help")
+            raise BMRLError(f"{where}: {name} is {number}; {_SAVED}; try a lower learning rate")
         if abs(number) > limit:
             raise BMRLError(
-                f"{where}: {name} is {number:.4g}, beyond {limit:.4g}; it explodes, as when "
-                f"critics chase their own targets. {_KEPT.capitalize()}; a lower learning rate or "
-                "tau, value_bounds or critic_grad_clip may help"
+                f"{where}: {name} is {number:.4g}, above {limit:.4g}; the training has diverged; "
+                f"{_SAVED}; try a lower learning rate or tau, value_bounds or critic_grad_clip"
             )
 
 
 def check_proposals(proposals: Tensor, demonstrated: Tensor, where: str) -> None:
-    """Stops a run whose generator proposes one action, or the bounds alone.
+    """Raises an error if the generator proposes a single action, or only actions at the bounds.
 
     Args:
         proposals: actions in [-1, 1], ``(*B, num_candidates, action_dim)``.
         demonstrated: actions of the data, ``(*B, action_dim)``; they may lie at the bounds.
-        where: what is trained, and its update.
+        where: the training and the update, for the message.
 
     Raises:
-        BMRLError: naming what is wrong.
+        BMRLError: naming the fault and settings that may help.
 
     Example:
         >>> import torch
         >>> check_proposals(torch.zeros(8, 4, 2), torch.zeros(8, 2), "bcq lift, update 100")
         Traceback (most recent call last):
         ...
-        torchrl_bmrl.errors.BMRLError: bcq lift, update 100: all candidates of a state are one ...
+        torchrl_bmrl.errors.BMRLError: bcq lift, update 100: all candidates of a state are equal ...
     """
     at_bound, usual = (
         (actions.abs() > 0.999).float().mean().item() for actions in (proposals, demonstrated)
     )
     if at_bound > SATURATED and usual < 0.9:
         raise BMRLError(
-            f"{where}: {at_bound:.0%} of the proposed actions' components lie at a bound, of the "
-            f"demonstrations' {usual:.0%}; the decoder is saturated, and no gradient frees it. "
-            f"{_KEPT.capitalize()}; a lower learning rate, or actions scaled to [-1, 1] may help"
+            f"{where}: {at_bound:.0%} of the proposed action components lie at a bound, and "
+            f"{usual:.0%} of the demonstrated ones; the decoder is saturated and has no gradient; "
+            f"{_SAVED}; try a lower learning rate, or scale the actions to [-1, 1]"
         )
     spread = (proposals.amax(-2) - proposals.amin(-2)).max().item()
     if proposals.shape[-2] > 1 and spread < DEAD:
         raise BMRLError(
-            f"{where}: all candidates of a state are one action (they differ by {spread:.1e}), so "
-            "that the critic has nothing to choose from; the decoder does not heed its latent. "
-            f"{_KEPT.capitalize()}; a lower kl_weight, or a larger latent_clip may help"
+            f"{where}: all candidates of a state are equal (they differ by {spread:.1e}); the "
+            f"decoder ignores its latent; {_SAVED}; try a lower kl_weight or a larger latent_clip"
         )

@@ -1,4 +1,4 @@
-"""Updates as one piece that runs eagerly, compiled, or as a captured CUDA graph."""
+"""Updates that run eagerly, compiled, or as a captured CUDA graph, and their optimizer step."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ Metrics = dict[str, Tensor]
 Update = Callable[[TensorDictBase], Metrics]
 
 WARM_UP = 3
-"""Eager updates before a capture: kernels are chosen and memory is taken in them."""
+"""Eager updates before a capture, in which kernels are chosen and memory is allocated."""
 
 
 def make_adam(params: Iterable[Tensor], lr: float) -> Adam:
-    """Adam for :func:`gradient_step`: one fused kernel, its step and learning rate on the device.
+    """Returns an Adam for :func:`gradient_step`, with a fused kernel.
 
-    A scheduler changes the learning rate in place, which neither a compiled nor a captured update
-    takes for another program.
+    The step and the learning rate are tensors on the device. A scheduler changes the learning rate
+    in place, so that a compiled or captured update stays valid.
 
     Args:
-        params: what is trained, on one device.
+        params: the parameters, on one device.
         lr: learning rate.
 
     Raises:
-        BMRLError: for a parameter that is an expanded or strided view: the fused kernel goes
-            through its memory from the first element on, and would hit others.
+        BMRLError: for a parameter that is an expanded or strided view: the fused kernel assumes
+            dense memory and would write into other elements.
 
     Example:
         >>> optimizer = make_adam(torch.nn.Linear(2, 1).parameters(), lr=1e-3)
@@ -46,12 +46,12 @@ def make_adam(params: Iterable[Tensor], lr: float) -> Adam:
     """
     params = list(params)
     if not params:
-        raise BMRLError("no parameters; valid: at least one that is trained")
+        raise BMRLError("no parameters; valid: at least one")
     for param in params:
         if not torch.ops.aten.is_non_overlapping_and_dense(param):
             raise BMRLError(
-                f"a parameter of the shape {tuple(param.shape)} has the strides {param.stride()}; "
-                "valid: one without gaps and overlaps, such as its contiguous()"
+                f"a parameter of shape {tuple(param.shape)} has strides {param.stride()}; "
+                "valid: dense memory, such as contiguous() returns"
             )
     rate = torch.tensor(lr, device=params[0].device)
     optimizer = Adam(params, lr=rate, fused=True)
@@ -65,13 +65,13 @@ def make_adam(params: Iterable[Tensor], lr: float) -> Adam:
 
 
 def keep_freed_memory() -> bool:
-    """Has the C library keep what PyTorch frees, and give it out again.
+    """Keeps freed memory in the allocator, so that the next update reuses it without page faults.
 
-    glibc returns large blocks to the system, and every update takes them anew, page by page: a
-    seventh of its time on a CPU at batch 128. The process holds on to its largest footprint.
+    By default glibc returns large blocks to the system; allocating them again takes a seventh of an
+    update's time on a CPU at batch 128. The memory of the process never shrinks afterwards.
 
     Returns:
-        whether it could be set; the C library of other systems than Linux has no such setting.
+        whether the option was set; only glibc has it.
 
     Example:
         >>> keep_freed_memory() in (True, False)
@@ -86,24 +86,21 @@ def keep_freed_memory() -> bool:
 
 
 def load_adam(optimizer: Adam, state: dict[str, Any]) -> None:
-    """Takes over what ``state_dict()`` gave, onto the optimizer's own device."""
+    """Loads a ``state_dict()`` onto the optimizer's own device."""
     optimizer.load_state_dict(state)
     for group in optimizer.param_groups:
         group["lr"] = torch.as_tensor(group["lr"]).to(group["params"][0].device)
         for param in group["params"]:
-            held = optimizer.state[param]
+            own = optimizer.state[param]
             for name in ("exp_avg", "exp_avg_sq"):
-                held[name] = _laid_out_as(param, held[name])
+                own[name] = _laid_out_as(param, own[name])
 
 
 def get_rng_state(device: str = "cpu") -> dict[str, Tensor]:
-    """State of PyTorch's random numbers, on the CPU and on a GPU that is the device.
+    """Returns the states of PyTorch's random number generators, ``"cpu"`` and for a GPU ``"cuda"``.
 
     Args:
-        device: that trains, such as ``"cpu"`` or ``"cuda:0"``.
-
-    Returns:
-        the states, under ``"cpu"`` and, for a GPU, ``"cuda"``.
+        device: device of the training, such as ``"cpu"`` or ``"cuda:0"``.
 
     Example:
         >>> state = get_rng_state()
@@ -119,11 +116,11 @@ def get_rng_state(device: str = "cpu") -> dict[str, Tensor]:
 
 
 def set_rng_state(state: dict[str, Tensor], device: str = "cpu") -> None:
-    """Takes over what :func:`get_rng_state` gave.
+    """Restores the states that :func:`get_rng_state` returned.
 
     Args:
-        state: of that function.
-        device: that trains; where the state has one of a GPU, this GPU takes it over.
+        state: the states.
+        device: device of the training; gets the GPU's state, if there is one.
 
     Example:
         >>> before = get_rng_state()
@@ -137,18 +134,16 @@ def set_rng_state(state: dict[str, Tensor], device: str = "cpu") -> None:
 
 
 def gradient_step(optimizer: Adam, loss: Tensor, max_norm: float | None = None) -> None:
-    """Does what ``loss.sum().backward()`` and ``optimizer.step()`` do, in one compiled program.
-
-    Compiled, those two are programs of their own with what surrounds them in Python between.
+    """Does ``loss.sum().backward()`` and ``optimizer.step()`` so that they compile as one program.
 
     Args:
-        optimizer: of :func:`make_adam`.
-        loss: shape ``()``, or of a :class:`~torchrl_bmrl.objectives.StackedLoss` ``[N]``.
-        max_norm: bound on the norm of the gradient, of each member for itself.
+        optimizer: from :func:`make_adam`.
+        loss: shape ``()``, or ``[N]`` of a :class:`~torchrl_bmrl.objectives.StackedLoss`.
+        max_norm: bound on the gradient's norm, separately for each member.
 
     Raises:
-        BMRLError: for an optimizer with several groups of parameters, options that this step does
-            not take, or a loss that does not depend on its parameters.
+        BMRLError: for an optimizer with several groups of parameters or unsupported options, or a
+            loss that does not depend on its parameters.
 
     Example:
         >>> weight = torch.nn.Parameter(torch.ones(1))
@@ -161,13 +156,13 @@ def gradient_step(optimizer: Adam, loss: Tensor, max_norm: float | None = None) 
     grads = torch.autograd.grad(loss.sum(), params, allow_unused=True)
     if all(grad is None for grad in grads):
         raise BMRLError(
-            "the loss does not depend on the optimizer's parameters; valid: the loss's own, such "
-            "as loss.qvalue_network_params.parameters(), not those of a module that it copied"
+            "the loss does not depend on the optimizer's parameters; valid: parameters of the "
+            "loss, such as loss.qvalue_network_params.parameters(), not of a module that it copied"
         )
-    # As torch's Adam: a parameter that the loss does not depend on stays, and its momentum with it.
+    # As in torch's Adam, a parameter without gradient stays unchanged, and so does its momentum.
     params = [param for param, grad in zip(params, grads, strict=True) if grad is not None]
     grads = [grad for grad in grads if grad is not None]
-    # The fused kernel goes through memory as the parameter lies; gradients may lie otherwise.
+    # The fused kernel reads memory in the parameter's order; gradients may have other strides.
     grads = [_laid_out_as(param, grad) for param, grad in zip(params, grads, strict=True)]
     state = [optimizer.state[param] for param in params]
     means, squares, steps = (
@@ -199,21 +194,21 @@ def gradient_step(optimizer: Adam, loss: Tensor, max_norm: float | None = None) 
 
 
 def _only_group(optimizer: Adam) -> dict[str, Any]:
-    """The optimizer's parameters and options; refuses what would be left out in silence."""
+    """Returns the optimizer's only group; refuses options that would be ignored."""
     if len(optimizer.param_groups) != 1 or not isinstance(optimizer.param_groups[0]["lr"], Tensor):
         raise BMRLError(
-            f"an optimizer with {len(optimizer.param_groups)} groups of parameters and lr "
-            f"{optimizer.param_groups[0]['lr']}; valid: one of make_adam"
+            f"the optimizer has {len(optimizer.param_groups)} groups of parameters and lr "
+            f"{optimizer.param_groups[0]['lr']}; valid: an optimizer of make_adam"
         )
     (group,) = optimizer.param_groups
     for name in ("weight_decay", "amsgrad", "maximize"):
         if group[name]:
-            raise BMRLError(f"{name} of the optimizer is {group[name]}; valid: 0, as of make_adam")
+            raise BMRLError(f"{name} of the optimizer is {group[name]}; valid: 0, as in make_adam")
     return group
 
 
 def _laid_out_as(param: Tensor, value: Tensor) -> Tensor:
-    """The value with the strides of a parameter."""
+    """Returns the value with the strides of a parameter."""
     if value.stride() == param.stride():
         return value
     return torch.empty_like(param, dtype=value.dtype, requires_grad=False).copy_(value)
@@ -231,10 +226,9 @@ def _traced_adam(
     lr: Tensor,
     eps: float,
 ) -> None:
-    """The fused kernel's equations; that kernel the compiler cannot join with what is around it."""
+    """The fused kernel's equations, since the compiler cannot fuse that kernel with other code."""
     torch._foreach_add_(steps, 1.0)
-    # Once, since they count alike, and as the fused kernel in float64: of 1 - 0.999 float32 has
-    # four digits.
+    # All steps are equal. In float64, as in the fused kernel: float32 has four digits of 1 - 0.999.
     count = steps[0].double()
     rate = lr.double() / (1.0 - beta1**count)
     root = (1.0 - beta2**count).rsqrt()
@@ -246,7 +240,7 @@ def _traced_adam(
 
 
 def _clipped(grads: list[Tensor], max_norm: float, members: int) -> list[Tensor]:
-    """As ``clip_grad_norm_``, over each member's gradients."""
+    """Clips as ``clip_grad_norm_`` does, separately for each member."""
     squares = [grad.square().flatten(members).sum(-1) for grad in grads]
     norm = torch.stack(squares).sum(0).sqrt()
     scale = (max_norm / (norm + 1e-6)).clamp(max=1.0)
@@ -256,22 +250,22 @@ def _clipped(grads: list[Tensor], max_norm: float, members: int) -> list[Tensor]
 def accelerate(
     update: Update, *, compiled: bool = False, captured: bool = False, device: str = "cpu"
 ) -> Update:
-    """An update that is compiled, or captured as a CUDA graph, or both.
+    """Compiles an update, captures it as a CUDA graph, or both.
 
-    Where that fails, at the first call or for want of a GPU, one message says why and the update
-    runs as it is. The first call takes the time of the compilation, about half a minute.
+    If this fails, or there is no GPU to capture on, a warning gives the reason and the update runs
+    eagerly. The first call takes about half a minute to compile.
 
-    On CPU a compiled update draws random numbers as the eager one does, so that their results are
-    equal. Compiling makes tensordicts no pytrees any more in the whole process, as
-    ``tensordict.nn.CudaGraphModule`` does.
+    On CPU a compiled update draws the same random numbers as the eager one, so that the results are
+    equal. After compiling, tensordicts are no longer pytrees in the whole process, as with
+    ``tensordict.nn.CudaGraphModule``.
 
     Args:
-        update: takes a batch, changes parameters in place and returns metrics. It must not look at
-            numbers (``item()``), and when captured its batches must all have one shape.
+        update: takes a batch, changes parameters in place and returns metrics. It must not read
+            values (``item()``); a captured one needs batches of one shape.
         compiled: whether to use :func:`torch.compile`.
-        captured: whether to record what it does on the GPU after some eager updates, and then
-            replay that. The metrics of a replay lie where those of the one before it lay.
-        device: that the update runs on.
+        captured: whether to capture the update after some eager calls and then replay the graph.
+            Each replay overwrites the metrics of the one before.
+        device: device of the update.
 
     Example:
         >>> weight = torch.nn.Parameter(torch.ones(1))
@@ -281,13 +275,13 @@ def accelerate(
         ...     gradient_step(optimizer, loss)
         ...     return {"loss": loss.detach()}
         >>> from tensordict import TensorDict
-        >>> update = accelerate(update, captured=True)  # no GPU: says so and goes on
+        >>> update = accelerate(update, captured=True)  # without a GPU: a warning, and eager
         >>> update(TensorDict({"x": torch.ones(1)}, []))["loss"]
         tensor(1.)
     """
     on_gpu = torch.device(device).type == "cuda"
     if captured and not on_gpu:
-        log.warning(f"device={device} has no CUDA graphs; the updates run without")
+        log.warning(f"device={device} has no CUDA graphs; the updates run without them")
         captured = False
     if not compiled and not captured:
         return update
@@ -299,15 +293,15 @@ def accelerate(
 
 
 class _Compiled:
-    """One compiled program of an update, its gradients in it."""
+    """An update as one compiled program, including its gradients."""
 
     def __init__(self, update: Update, on_gpu: bool) -> None:
         import torch._dynamo
         from tensordict.nn.functional_modules import _exclude_td_from_pytree
 
-        # Said again whenever an update is compiled anew, and nothing that a user could act on.
+        # Repeated at every compilation, and users cannot act on it.
         warnings.filterwarnings("ignore", r"Using lock_\(\) inside a compiled graph")
-        # vmap over tensordicts does this at every call, and each would be compiled anew.
+        # vmap over tensordicts sets this at every call, and each call would be compiled again.
         _exclude_td_from_pytree().set()
         self.config = torch._dynamo.config
         # The compiler's own random numbers are slow on CPU.
@@ -315,14 +309,14 @@ class _Compiled:
         self.update = torch.compile(update, fullgraph=True, options=options)
 
     def __call__(self, batch: TensorDictBase) -> Metrics:
-        # Not for the whole process: in a function that is compiled in several pieces and calls
-        # backward(), PyTorch 2.13 then leaves the gradients out without a word.
+        # Only here: with this option PyTorch 2.13 silently leaves out the gradients of a function
+        # that calls backward() and is compiled in several pieces.
         with self.config.patch(trace_autograd_ops=True):
             return self.update(batch)
 
 
 class _WithFallback:
-    """Runs the fast version; if its first calls fail, the plain one from then on."""
+    """Runs the fast version, or the plain one from the first calls on if one of them fails."""
 
     def __init__(self, fast: Update, plain: Update) -> None:
         self.fast, self.plain, self.left = fast, plain, WARM_UP + 1
@@ -333,14 +327,14 @@ class _WithFallback:
         self.left -= 1
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # what compilers say about tensordict's internals
+                warnings.simplefilter("ignore")  # compilers warn about tensordict's internals
                 return self.fast(batch)
         except Exception as error:
-            # A program that cannot be made has not run in part; what an eager update before a
-            # capture cannot do, the plain one cannot either, and it says so itself.
+            # A compilation that fails has changed nothing, so the update can be repeated. An error
+            # in an eager update before a capture is raised again by the plain one.
             reason = str(error).strip().partition("\n")[0]
             log.warning(
-                f"updates are not accelerated ({type(error).__name__}: {reason}); they run as is"
+                f"updates are not accelerated ({type(error).__name__}: {reason}); they run eagerly"
             )
             self.fast, self.left = self.plain, 0
             return self.plain(batch)
@@ -349,7 +343,7 @@ class _WithFallback:
 class _Captured:
     """A CUDA graph of an update.
 
-    tensordict's CudaGraphModule waits for the device before every replay; this does not.
+    Unlike tensordict's ``CudaGraphModule``, it does not wait for the device before a replay.
     """
 
     def __init__(self, update: Update) -> None:
