@@ -29,7 +29,8 @@ def tasks(*names: str) -> str:
 SMALL = [
     "preset=smoke",
     tasks("reach", "lift"),
-    "collect.train_episodes={default:1,lift:1}",
+    "collect.train_episodes.reach=1",
+    "collect.train_episodes.lift=1",
     "bcq.epochs=2",
     "bcq.updates_per_epoch=6",
     "bcq.batch_size=8",

@@ -58,8 +58,8 @@ class Run:
     Example:
         >>> import tempfile
         >>> run = Run(Settings(run_dir=tempfile.mkdtemp(), tasks=["reach", "lift"]))
-        >>> run.settings.collect.train_episodes
-        {'reach': 60, 'lift': 80}
+        >>> run.settings.collect.train_episodes["lift"]
+        80
         >>> with run:
         ...     run.seed("collect", "lift", 3) == run.seed("collect", "lift", 4)
         False
