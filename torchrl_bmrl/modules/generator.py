@@ -10,24 +10,56 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torch.nn.functional import linear
 from torchrl.modules import MLP
 
 from torchrl_bmrl.generators import Autoencoder
 
 
-class RowsMLP(MLP):
-    """TorchRL's MLP, whose layers see all batch dimensions as one."""
+class CandidateMLP(MLP):
+    """TorchRL's MLP, which computes once what all candidates of a state have in common.
+
+    An input that is the same for all candidates is expanded along the second to last dimension
+    (its stride there is 0). Its part of the first layer is computed once and added to each
+    candidate's own part.
+
+    Example:
+        >>> network = CandidateMLP(3, 2, num_cells=[8])
+        >>> state, actions = torch.randn(5, 1, 1).expand(5, 10, 1), torch.randn(5, 10, 2)
+        >>> whole = network(state.contiguous(), actions)
+        >>> torch.allclose(network(state, actions), whole, atol=1e-6)
+        True
+    """
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Output for the inputs, concatenated along the last dimension."""
-        hidden = torch.cat(inputs, -1) if len(inputs) > 1 else inputs[0]
-        shape = hidden.shape[:-1]
-        # With more dimensions a layer's output is a view, and to change a view in place, as ReLU
-        # does here, costs several copies in the backward pass.
-        hidden = hidden.reshape(-1, hidden.shape[-1])
-        for layer in self:
+        first, *rest = self
+        alike = [x.ndim > 1 and x.shape[-2] > 1 and x.stride(-2) == 0 for x in inputs]
+        if any(alike) and not all(alike):
+            weights = first.weight.split([x.shape[-1] for x in inputs], -1)
+            parts = list(zip(inputs, weights, alike, strict=True))
+            once = [(x[..., :1, :], weight) for x, weight, same in parts if same]
+            each = [(x, weight) for x, weight, same in parts if not same]
+            hidden = _linear(each) + _linear(once, first.bias)
+            shape = hidden.shape[:-1]
+            hidden = hidden.reshape(-1, hidden.shape[-1])
+        else:
+            whole = torch.cat(inputs, -1) if len(inputs) > 1 else inputs[0]
+            shape = whole.shape[:-1]
+            # In rows: else the layer's output is a view, and to change a view in place, as ReLU
+            # does here, costs several copies in the gradient.
+            hidden = first(whole.reshape(-1, whole.shape[-1]))
+        for layer in rest:
             hidden = layer(hidden)
         return hidden.reshape(*shape, hidden.shape[-1])
+
+
+def _linear(parts: Sequence[tuple[Tensor, Tensor]], bias: Tensor | None = None) -> Tensor:
+    """Linear layer of inputs, each with its columns of the weights."""
+    inputs, weights = zip(*parts, strict=True)
+    if len(parts) == 1:
+        return linear(inputs[0], weights[0], bias)
+    return linear(torch.cat(inputs, -1), torch.cat(weights, -1), bias)
 
 
 class Network(TensorDictModule):
@@ -98,7 +130,7 @@ def make_mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> M
         >>> make_mlp(3, 2, (8,))(torch.zeros(5, 1), torch.zeros(5, 2)).shape
         torch.Size([5, 2])
     """
-    return RowsMLP(
+    return CandidateMLP(
         in_features,
         out_features,
         num_cells=list(num_cells),
