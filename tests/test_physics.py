@@ -75,7 +75,7 @@ def test_without_that_library_robosuites_step_stands_in_and_a_warning_names_thos
     )
     assert done.returncode == 0, done.stderr
     (line,) = done.stdout.splitlines()
-    assert "robosuite's own, and slow" in line
+    assert "slow steps with robosuite's own code" in line
     assert "no libmujoco" in line
     assert mujoco.__version__ in line
 

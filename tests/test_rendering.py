@@ -98,7 +98,7 @@ def test_an_environment_that_cannot_draw_is_refused_at_once(
 def test_episodes_side_by_side_are_drawn_as_each_alone_and_go_on_as_undrawn(library: str) -> None:
     vector = gymnasium.make_vec(gymnasium_id("lift"), num_envs=2, render_mode="rgb_array")
     undrawn = TabletopVectorEnv("lift", num_envs=2)
-    with pytest.raises(BMRLError, match="starts with reset"):
+    with pytest.raises(BMRLError, match="call reset first"):
         vector.render()
     vector.reset(seed=[3, 4])
     undrawn.reset(seed=[3, 4])

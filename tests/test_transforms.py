@@ -13,17 +13,19 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import Composite, Unbounded
 
 from torchrl_bmrl.data.episodes import Episode, stack_episodes
+from torchrl_bmrl.envs.perturbation import PerturbAction, tilt
 from torchrl_bmrl.envs.transforms import (
-    OBSERVATION_PARTS,
     ObservationStatistics,
-    PerturbAction,
     SinCosTransform,
     StageReward,
     make_observation_transform,
-    tilt,
     transform_data,
 )
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.experts.tabletop import OBSERVATION_PARTS
+from torchrl_bmrl.tasks import get_task
+
+TASK = get_task("push_left")
 
 SIZES = {
     "robot0_joint_pos": 7,
@@ -95,7 +97,7 @@ def test_observation_is_33_numbers_in_the_documented_order() -> None:
     )
     (episode,) = random_episodes(1, seed=0)
     data = stack_episodes([episode], task=0)
-    out = make_observation_transform()(data.copy())
+    out = make_observation_transform(TASK)(data.copy())
     expected = torch.as_tensor(raw_observation(episode.observations)).float()
     assert out["observation"].shape == (6, 33)
     torch.testing.assert_close(out["observation"], expected)
@@ -107,7 +109,7 @@ def test_stored_transitions_are_normalised_now_and_next() -> None:
     statistics = ObservationStatistics(torch.arange(33.0), torch.linspace(0.5, 2, 33))
     data = stack_episodes([episode], task=3)
     kept = data.clone()
-    out = transform_data(data, statistics)
+    out = transform_data(data, TASK, statistics)
     for observation, parts in (
         (out["observation"], episode.observations),
         (out["next", "observation"], episode.next_observations),
@@ -123,13 +125,13 @@ def test_stored_transitions_are_normalised_now_and_next() -> None:
 def test_every_task_weighs_the_same_however_many_steps_it_has() -> None:
     few = stack_episodes(random_episodes(2, seed=2, loc=1.0, scale=0.1), task=0)
     many = stack_episodes(random_episodes(40, seed=3, loc=-1.0, scale=0.1), task=1)
-    statistics = ObservationStatistics.of([few, many])
-    assert ObservationStatistics.of([few, few, many]).loc[20] > statistics.loc[20] + 0.2
+    statistics = ObservationStatistics.of([few, many], [TASK] * 2)
+    assert ObservationStatistics.of([few, few, many], [TASK] * 3).loc[20] > statistics.loc[20] + 0.2
     # Goal and positions: half of the weight at +1, half at -1.
     torch.testing.assert_close(statistics.loc[23:], torch.zeros(10), atol=0.1, rtol=0)
     torch.testing.assert_close(statistics.scale[23:], torch.ones(10), atol=0.1, rtol=0)
     repeated = stack_episodes(random_episodes(2, seed=2, loc=1.0, scale=0.1) * 20, task=0)
-    again = ObservationStatistics.of([repeated, many])
+    again = ObservationStatistics.of([repeated, many], [TASK] * 2)
     torch.testing.assert_close(again.loc, statistics.loc)
     torch.testing.assert_close(again.scale, statistics.scale)
 
@@ -138,8 +140,8 @@ def test_normalised_training_data_have_mean_0_and_deviation_1() -> None:
     datasets = [
         stack_episodes(random_episodes(5, seed=i, loc=i, scale=1 + i), task=i) for i in range(3)
     ]
-    statistics = ObservationStatistics.of(datasets)
-    observation = torch.cat([transform_data(d, statistics)["observation"] for d in datasets])
+    statistics = ObservationStatistics.of(datasets, [TASK] * 3)
+    observation = torch.cat([transform_data(d, TASK, statistics)["observation"] for d in datasets])
     torch.testing.assert_close(observation.mean(0), torch.zeros(33), atol=1e-5, rtol=0)
     torch.testing.assert_close(observation.std(0, correction=0), torch.ones(33), atol=1e-5, rtol=0)
 
@@ -147,8 +149,8 @@ def test_normalised_training_data_have_mean_0_and_deviation_1() -> None:
 def test_a_part_that_never_changes_stays_finite() -> None:
     data = stack_episodes(random_episodes(2, seed=0), task=0)
     data["goal_pos"] = torch.full_like(data["goal_pos"], 0.8)
-    statistics = ObservationStatistics.of([data])
-    out = transform_data(data, statistics)["observation"]
+    statistics = ObservationStatistics.of([data], [TASK] * 1)
+    out = transform_data(data, TASK, statistics)["observation"]
     assert (statistics.scale > 0).all()
     assert out.isfinite().all()
     torch.testing.assert_close(out[:, 30:], torch.zeros(12, 3), atol=1e-3, rtol=0)
@@ -183,7 +185,7 @@ def test_data_and_environment_give_the_same_observation_for_the_same_episode() -
         rewards=np.array(rewards),
         terminated=np.zeros(8, bool),
     )
-    stored = transform_data(stack_episodes([episode], task=0), statistics)
+    stored = transform_data(stack_episodes([episode], task=0), TASK, statistics)
 
     env = make_env("push_left", statistics)
     steps = iter(torch.as_tensor(actions))

@@ -71,11 +71,11 @@ def test_bad_calls_of_a_vector_environment_are_answered() -> None:
     with pytest.raises(BMRLError, match="num_envs is 0"):
         TabletopVectorEnv("reach", num_envs=0)
     vector = TabletopVectorEnv("reach", num_envs=2)
-    with pytest.raises(BMRLError, match="starts with reset"):
+    with pytest.raises(BMRLError, match="call reset first"):
         vector.step(np.zeros((2, 7)))
     with pytest.raises(BMRLError, match="3 seeds for 2 environments"):
         vector.reset(seed=[1, 2, 3])
-    with pytest.raises(BMRLError, match="never started"):
+    with pytest.raises(BMRLError, match="have not started"):
         vector.reset(options={"reset_mask": np.array([True, False])})
     vector.reset(seed=0)
     before = vector.get_states()

@@ -86,7 +86,7 @@ class _FastStep:
             if (obstacle := why_not_fast(env)) is not None:
                 if obstacle.reason not in self.warned:
                     self.warned.add(obstacle.reason)
-                    message = f"steps are robosuite's own, and slow: {obstacle}"
+                    message = f"slow steps with robosuite's own code: {obstacle}"
                     warnings.warn(message, RuntimeWarning, stacklevel=2)
                 return type(env).step(env, action)
             self.stepper = stepper = FastStepper(env)

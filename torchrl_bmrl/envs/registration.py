@@ -7,7 +7,7 @@ from torchrl_bmrl.extras import needs
 
 
 def gymnasium_id(task: str) -> str:
-    """The registered id of a task; all compositions share one.
+    """Returns the registered id of a task; all compositions share one id.
 
     Args:
         task: names of :data:`~torchrl_bmrl.envs.skills.SKILLS`, joined by ``-``.
@@ -26,7 +26,8 @@ def gymnasium_id(task: str) -> str:
 def register() -> None:
     """Registers ``bmrl/SawyerReach-v0``, its five siblings and the compositions (idempotent).
 
-    ``robot="Panda"`` gives an id another arm, ``skills=`` the compositions' id other skills.
+    ``gymnasium.make(id, robot="Panda")`` selects another arm. For the compositions' id,
+    ``skills=`` selects other skills.
 
     Example:
         >>> register()
@@ -38,7 +39,7 @@ def register() -> None:
         MissingExtraError: without gymnasium.
     """
     with needs("robosuite"):
-        # As a plugin this is called while gymnasium itself is imported.
+        # gymnasium calls this plugin while it is being imported itself.
         from gymnasium.envs import registration
 
     for task, horizon in {**dict.fromkeys(SKILLS, 200), "reach-lift-reach": 300}.items():
@@ -47,7 +48,7 @@ def register() -> None:
                 gymnasium_id(task),
                 entry_point="torchrl_bmrl.envs.tabletop:TabletopEnv",
                 vector_entry_point="torchrl_bmrl.envs.vector:TabletopVectorEnv",
-                # gymnasium's TimeLimit would count anew when a state is restored.
+                # gymnasium's TimeLimit would restart its count when a state is restored.
                 kwargs={"skills": task, "horizon": horizon},
                 disable_env_checker=True,
             )

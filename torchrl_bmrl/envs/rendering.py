@@ -1,8 +1,8 @@
-"""Pictures of simulator states, with or without a GPU, or a clear word why there are none.
+"""Renders simulator states, with or without a GPU.
 
-MuJoCo chooses its graphics library once, when it is imported, and a broken one may end the process.
-So stored states are rendered in a process of its own, which tries one library after the other, and
-an environment uses the library with which such a process made a picture.
+MuJoCo chooses its graphics library once, at import, and a broken library may kill the process.
+Therefore stored states are rendered in a subprocess for each library until one works, and an
+environment uses the library that worked.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from torchrl_bmrl.errors import BMRLError, RenderError
 from torchrl_bmrl.extras import needs
 
 GOAL_MARKER = "goal_marker"
-"""The one site of a scene that is shown; the others are robosuite's own aids."""
+"""The only visible site of a scene; the others are auxiliary sites of robosuite."""
 
 _CONTEXTS = ("egl", "osmesa", "glfw")
-"""Modules of mujoco with a context for each library, as ``MUJOCO_GL`` names them."""
+"""Modules of mujoco with a GL context; the names are also values of ``MUJOCO_GL``."""
 _TARGET = (-0.1, 0.0, 0.98)  # between table and arm [m]
 _DISTANCE, _AZIMUTH, _ELEVATION = 1.4, 180.0, -20.0  # in front of the table [m, deg, deg]
 
@@ -39,24 +39,24 @@ def render_states(
     size: int = 192,
     report: Callable[[int], Any] = lambda frames: None,
 ) -> list[NDArray[np.uint8]]:
-    """Pictures of simulator states as demonstrations keep them, seen from the front of the table.
+    """Renders the simulator states of demonstrations, seen from the front of the table.
 
-    ``MUJOCO_GL`` chooses the graphics library; where it is not set, EGL and OSMesa are tried, and
-    GLFW where there is a display.
+    ``MUJOCO_GL`` selects the graphics library. If it is not set, EGL and OSMesa are tried, and GLFW
+    if there is a display.
 
     Args:
-        scenes: For each episode its model as MJCF text and its states, shape ``(T, 1 + nq + nv)``:
+        scenes: the model of each episode as MJCF text and its states, shape ``(T, 1 + nq + nv)``:
             time, joint positions, joint velocities (robosuite's flattened state).
-        size: Height and width of a picture [pixels].
-        report: Called with the number of pictures made since its last call; negative where a
-            library failed and the next one starts anew.
+        size: height and width of a picture [pixels].
+        report: called with the number of new pictures; with a negative number if a library failed
+            and the next one starts again.
 
     Returns:
-        For each episode its pictures, shape ``(T, size, size, 3)``.
+        the pictures of each episode, shape ``(T, size, size, 3)``.
 
     Raises:
         BMRLError: if states have another shape or are not finite.
-        RenderError: if no graphics library works here; it says what each one said.
+        RenderError: with each library's error, if none works.
 
     Example:
         >>> render_states([])
@@ -70,23 +70,23 @@ def render_states(
 
 @cache
 def graphics_library() -> str:
-    """Value of ``MUJOCO_GL`` with which pictures can be made here; "" is MuJoCo's own choice.
+    """Returns a value of ``MUJOCO_GL`` that works on this machine; "" is MuJoCo's default.
 
-    It is tried out in a process of its own, once, which takes about a second.
+    The first call tests the libraries in a subprocess, which takes about a second.
 
     Raises:
-        RenderError: if no graphics library works here; it says what each one said.
+        RenderError: with each library's error, if none works.
     """
     return _rendered([("<mujoco/>", np.zeros((1, 1)))], 8, lambda frames: None)[0]
 
 
 def make_renderer(model: Any, height: int, width: int) -> Any:
-    """A ``mujoco.Renderer`` with :func:`graphics_library`, whatever mujoco chose at its import.
+    """Returns a ``mujoco.Renderer`` that uses :func:`graphics_library`.
 
     Args:
         model: ``mujoco.MjModel``.
-        height: of a picture [pixels].
-        width: likewise.
+        height: height of a picture [pixels].
+        width: width of a picture [pixels].
 
     Raises:
         RenderError: if the graphics library does not work in this process.
@@ -103,7 +103,7 @@ def make_renderer(model: Any, height: int, width: int) -> Any:
         if library in _CONTEXTS:
             chosen.GLContext = import_module(f"mujoco.{library}").GLContext
         return mujoco.Renderer(model, height, width)
-    except Exception as error:  # a graphics library raises what it likes
+    except Exception as error:  # graphics libraries raise errors of any type
         reason = str(error).strip().partition("\n")[0] or type(error).__name__
         raise RenderError([f"{library or 'the default'}: {reason}"]) from error
     finally:
@@ -113,7 +113,7 @@ def make_renderer(model: Any, height: int, width: int) -> Any:
 def _rendered(
     scenes: Sequence[tuple[str, NDArray[Any]]], size: int, report: Callable[[int], Any]
 ) -> tuple[str, list[NDArray[np.uint8]]]:
-    """The first library that works, and each scene's pictures."""
+    """Returns the first library that works, and each scene's pictures."""
     problems = []
     with tempfile.TemporaryDirectory() as folder:
         task, result = Path(folder, "scenes.npz"), Path(folder, "frames.npz")
@@ -129,7 +129,7 @@ def _rendered(
 
 
 def _libraries() -> list[str]:
-    """Values of ``MUJOCO_GL`` to try; "" is MuJoCo's own choice."""
+    """Values of ``MUJOCO_GL`` to try; "" is MuJoCo's default."""
     if chosen := os.environ.get("MUJOCO_GL"):
         return [chosen]
     if sys.platform != "linux":
@@ -139,11 +139,11 @@ def _libraries() -> list[str]:
 
 
 def _run(library: str, arguments: list[str], report: Callable[[int], Any]) -> str | None:
-    """Renders with one library; returns what went wrong."""
+    """Renders with one library in a subprocess; returns its error, or ``None``."""
     environment = {**os.environ, "MUJOCO_GL": library}
     # PyOpenGL must load the same library, or it finds no context.
     environment |= {"PYOPENGL_PLATFORM": library} if library in ("egl", "osmesa") else {}
-    # The package lies beside this one wherever the process was started.
+    # The subprocess must import this package, whatever its working directory.
     paths = [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")]
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
     with (
@@ -175,7 +175,7 @@ def _run(library: str, arguments: list[str], report: Callable[[int], Any]) -> st
 
 
 def _render(task: str, result: str) -> None:
-    """The process: pictures of all scenes, one line of output for each."""
+    """Main function of the subprocess: renders all scenes, one line of output for each picture."""
     with needs("robosuite"):
         import mujoco
 
@@ -189,7 +189,7 @@ def _render(task: str, result: str) -> None:
     with np.load(task) as scenes:
         size = int(scenes["size"])
         for number, text in enumerate(scenes["models"]):
-            # Scenes differ in the place of the marker alone: compiling each would take seconds.
+            # Compiling takes seconds, and scenes differ only in the marker's position.
             root = ET.fromstring(str(text))
             marker = root.find(f".//site[@name='{GOAL_MARKER}']")
             place = None if marker is None else np.array(marker.get("pos", "0 0 0").split(), float)
@@ -204,9 +204,9 @@ def _render(task: str, result: str) -> None:
             pictures = []
             for state in scenes[f"states{number}"]:
                 data.qpos[:] = state[1 : 1 + model.nq]
-                mujoco.mj_fwdPosition(model, data)  # lights, too
+                mujoco.mj_fwdPosition(model, data)  # also places the lights
                 renderer.update_scene(data, camera=camera, scene_option=options)
-                # Reset by update_scene. On a processor they are most of the time.
+                # update_scene resets these flags. On a CPU they take most of the time.
                 for effect in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
                     renderer.scene.flags[effect] = 0
                 pictures.append(renderer.render())
@@ -217,7 +217,7 @@ def _render(task: str, result: str) -> None:
 
 def _make_renderer(mujoco: Any, text: str, size: int) -> tuple[Any, Any, Any]:
     model = mujoco.MjModel.from_xml_string(text)
-    model.vis.quality.offsamples = 0  # smooth edges, at three times the time
+    model.vis.quality.offsamples = 0  # no antialiasing: a third of the time
     for index in range(model.nsite):
         if model.site(index).name != GOAL_MARKER:
             model.site_rgba[index, 3] = 0.0

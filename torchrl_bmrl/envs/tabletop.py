@@ -20,14 +20,14 @@ with needs("robosuite"):
     import mujoco
 
 STEPPERS = ("fast", "robosuite")
-"""What advances the simulator; both give the same trajectories to the bit."""
+"""Implementations of a simulation step; both give the same trajectories to the bit."""
 
 _PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION
 _warned: set[str] = set()
 
 
 class TabletopEnv(gymnasium.Env):
-    """One skill, or several in a row, with one arm at a table.
+    """One skill, or a composition of several, with one arm at a table.
 
     The observation is a dict of named parts under robosuite's names, float64, for an arm with n
     joints and a gripper with k: ``robot0_joint_pos`` (n,) [rad], ``robot0_gripper_qpos`` (k,) [m]
@@ -40,33 +40,32 @@ class TabletopEnv(gymnasium.Env):
     ``info`` contains ``success``, each reward term as ``reward_<term>`` (0 for terms of other
     skills) and ``stage``, the number of the composition's skills that are done (0 for one skill).
 
-    In a composition goal and reward are those of the skill at hand. ``success`` holds from the step
-    on at which the last skill succeeds.
+    In a composition, goal and reward are those of the current skill. ``success`` is true from the
+    step at which the last skill succeeds.
 
     An episode never terminates. The registered ids are truncated after 200 steps, compositions
     after 100 for each skill.
 
     Args:
-        skills: a :class:`~torchrl_bmrl.envs.skills.Skill`, several in a row, or names of
+        skills: a :class:`~torchrl_bmrl.envs.skills.Skill`, a sequence of them, or names of
             :data:`~torchrl_bmrl.envs.skills.SKILLS` joined by ``-``, such as ``"reach-lift"``.
         render_mode: ``None`` or ``"rgb_array"``, which needs no display
             (:func:`torchrl_bmrl.envs.rendering.graphics_library`).
         camera: robosuite camera for :meth:`render`.
         image_size: height and width of the rendered picture [pixels].
         robot: the arm, one of :data:`torchrl_bmrl.envs.arms.ARMS`.
-        gripper: robosuite's name of a gripper, or ``"default"`` for the one that robosuite gives
-            the arm.
-        stepper: ``"fast"``, compiled code that computes robosuite's trajectories bit by bit, or
-            ``"robosuite"``. A controller that the compiled code does not cover is advanced by
-            robosuite; a warning says so once.
+        gripper: robosuite's name of a gripper; ``"default"`` is robosuite's default for the arm.
+        stepper: ``"fast"``, compiled code with robosuite's trajectories to the bit, or
+            ``"robosuite"``. For a controller that the compiled code does not support, robosuite is
+            used after a warning.
         controller_configs: robosuite's composite controller; by default the arm's
             operational-space control of the pose.
         horizon: steps after which an episode is truncated; ``None`` for no limit. (gymnasium's
-            ``max_episode_steps`` would count anew when a state is restored.)
+            ``max_episode_steps`` would restart its count when a state is restored.)
 
     Raises:
         UnknownNameError: for an unknown skill, arm, render mode or stepper.
-        RenderError: for ``render_mode="rgb_array"`` where no graphics library works.
+        RenderError: for ``render_mode="rgb_array"`` if no graphics library works.
 
     Example:
         >>> env = TabletopEnv("lift")
@@ -99,7 +98,7 @@ class TabletopEnv(gymnasium.Env):
         if stepper not in STEPPERS:
             raise UnknownNameError("stepper", stepper, STEPPERS)
         if render_mode is not None:
-            graphics_library()  # not only at the first picture
+            graphics_library()  # raises its error now and not at the first picture
         self.render_mode = render_mode
         self.camera = camera
         self.image_size = image_size
@@ -137,7 +136,7 @@ class TabletopEnv(gymnasium.Env):
         return "-".join(skill.name for skill in self.robosuite_env.skills)
 
     def _info(self, terms: dict[str, float]) -> dict[str, Any]:
-        # TorchRL's info reader asks every value for its dtype.
+        # TorchRL's info reader needs values with a dtype.
         return {
             "success": np.bool_(self.robosuite_env._check_success()),
             "stage": np.int64(self.robosuite_env.stage),
@@ -150,7 +149,7 @@ class TabletopEnv(gymnasium.Env):
         """Starts an episode; the same ``seed`` gives the same episode.
 
         Args:
-            seed: of this start and of later unseeded ones.
+            seed: seed of this reset and of later ones without a seed.
             options: ``{"state": state}`` continues from a state of :meth:`get_state` instead.
 
         Raises:
@@ -158,10 +157,10 @@ class TabletopEnv(gymnasium.Env):
         """
         super().reset(seed=seed)
         if options and "state" in options:
-            self.set_state(options["state"])  # includes the random numbers: the seed has no effect
+            self.set_state(options["state"])  # includes the generator's state: seed has no effect
         else:
             if seed is not None:
-                # In place: robosuite's samplers hold a reference to this generator.
+                # In place, since robosuite's samplers refer to this generator.
                 state = np.random.default_rng(seed).bit_generator.state
                 self.robosuite_env.rng.bit_generator.state = state
             self.robosuite_env.reset()
@@ -173,7 +172,7 @@ class TabletopEnv(gymnasium.Env):
         """Acts for one control period (50 ms).
 
         Raises:
-            BMRLError: if the action has another shape or is not finite; nothing moves then.
+            BMRLError: if the action has another shape or is not finite; no step is made then.
         """
         action = np.asarray(action, dtype=np.float64)
         shape = self.action_space.shape
@@ -194,7 +193,7 @@ class TabletopEnv(gymnasium.Env):
             except BMRLError as error:
                 if str(error) not in _warned:
                     _warned.add(str(error))
-                    warnings.warn(f"steps are robosuite's own, and slow: {error}", stacklevel=3)
+                    warnings.warn(f"slow steps with robosuite's own code: {error}", stacklevel=3)
         if self._fast is None:
             env.step(action)
             return
@@ -206,14 +205,14 @@ class TabletopEnv(gymnasium.Env):
     # -- state ---------------------------------------------------------------------------------
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """The complete state of the episode and of the random numbers, as arrays.
+        """Returns the complete state of the episode and of the random generator, as arrays.
 
         ``physics``: MuJoCo's integration state (positions, velocities, warm start, controls, time);
-        ``gripper`` and ``rest_joints``: the memory of robosuite's gripper and arm controllers;
-        ``goal_start``; in compositions ``stage`` and ``targets``; ``steps`` taken; ``rng`` of the
-        starts to come. ``np.savez`` can save it.
+        ``gripper`` and ``rest_joints``: internal state of robosuite's gripper and arm controllers;
+        ``goal_start``; in compositions ``stage`` and ``targets``; number of ``steps``; ``rng``,
+        which decides later resets. ``np.savez`` can save it.
 
-        It is exact for the arms' default controllers and all others that do not interpolate goals.
+        It is exact for controllers that do not interpolate goals, such as the arms' default ones.
         """
         env, robot = self.robosuite_env, self.robosuite_env.robots[0]
         model, data = env.sim.model._model, env.sim.data._data
@@ -230,18 +229,18 @@ class TabletopEnv(gymnasium.Env):
         }
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Restores a state of :meth:`get_state`, of this environment or of another one.
+        """Restores a state of :meth:`get_state`, also one of another environment.
 
-        The episode continues as if it had never been interrupted, with this environment's skill:
-        states of lift and of the four pushes can be exchanged.
+        The episode continues exactly, with the skill of this environment. States of lift and of the
+        four pushes fit each other's environments.
 
         Raises:
-            BMRLError: if an array is missing, unknown, of another shape or not finite; nothing
-                changes then.
+            BMRLError: if an array is missing, unknown, of another shape or not finite; the
+                environment does not change then.
         """
         now = self.get_state()
         if state.keys() != now.keys():
-            raise BMRLError(f"a state has {sorted(state)}; valid: {sorted(now)}")
+            raise BMRLError(f"the state has {sorted(state)}; valid: {sorted(now)}")
         arrays = {name: np.asarray(state[name]) for name in now}
         for name, array in arrays.items():
             valid = now[name]
@@ -258,13 +257,13 @@ class TabletopEnv(gymnasium.Env):
         env.rng.bit_generator.state = _rng_from_array(arrays["rng"])
 
     def _load_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Restores a state without the poses that follow from it and without random numbers."""
+        """Restores a state except for the derived poses and the random generator."""
         env, robot = self.robosuite_env, self.robosuite_env.robots[0]
         mujoco.mj_setState(env.sim.model._model, env.sim.data._data, state["physics"], _PHYSICS)
         robot.gripper["right"].current_action = state["gripper"].copy()
         arm = robot.composite_controller.part_controllers["right"]
         arm.initial_joint = state["rest_joints"].copy()
-        # Otherwise robosuite continues from the pose that it read last.
+        # Otherwise robosuite's controller would use the last pose that it read.
         arm.new_update = True
         env.set_episode_state(state)
         env.timestep = int(state["steps"][0])
@@ -283,7 +282,7 @@ class TabletopEnv(gymnasium.Env):
     def _draw(self) -> np.ndarray:
         env = self.robosuite_env
         if self._picture is None:
-            # The simulated model may lack what cameras see.
+            # The simulated model may lack visual geometry.
             model = mujoco.MjModel.from_xml_string(env.scene_xml())
             self._picture = model, mujoco.MjData(model), make_renderer(model, *self.image_size)
         model, data, renderer = self._picture
@@ -312,7 +311,7 @@ def _rng_to_array(rng: np.random.Generator) -> np.ndarray:
 
 
 def _rng_from_array(array: np.ndarray) -> dict[str, Any]:
-    """The state that :func:`_rng_to_array` turned into an array."""
+    """Inverse of :func:`_rng_to_array`."""
     words = [int(word) for word in array]
     return {
         "bit_generator": "PCG64",

@@ -1,8 +1,7 @@
-"""From the environment's named parts to ``observation``: the same on data and in environments."""
+"""Transforms from named parts to ``observation``, for environments and stored data alike."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,13 +20,13 @@ from torchrl.envs.transforms import (
     Transform,
 )
 
-from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
+from torchrl_bmrl.errors import BMRLError, ConfigError
 from torchrl_bmrl.functional import nonzero_scale
 from torchrl_bmrl.tasks import Task, get_task
 
 
 class SinCosTransform(Transform):
-    """Replaces angles by their sines and cosines: 0 and 2π become the same point.
+    """Replaces angles by their sines and cosines, so that 0 and 2π are the same point.
 
     Args:
         in_key: angles [rad], ``(*B, n)``; removed.
@@ -59,7 +58,7 @@ class SinCosTransform(Transform):
         return self._call(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Two parts for the angles' one."""
+        """Replaces the angles' entry by two entries."""
         spec = observation_spec[self.in_keys[0]]
         del observation_spec[self.in_keys[0]]
         for key in self.out_keys:
@@ -67,107 +66,17 @@ class SinCosTransform(Transform):
         return observation_spec
 
 
-class PerturbAction(Transform):
-    """Executes other motions than the policy asks for; ``action`` in the data stays the policy's.
-
-    The motion (position and rotation delta) is scaled, the direction of the position delta is
-    tilted, and the result clipped to [-1, 1]. The gripper's command is left alone. The draws are
-    uniform, from PyTorch's global random state.
-
-    Args:
-        magnitude: range of the factor.
-        max_angle: largest angle of the tilt [degrees].
-        per: ``"step"`` draws anew for every action, ``"episode"`` once at a reset, as for a robot
-            that is calibrated badly.
-
-    Raises:
-        BMRLError: if the range is empty or negative, the angle not in [0, 180], or ``per`` another
-            word.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> transform = PerturbAction(magnitude=(0.5, 0.5))
-        >>> transform.inv(TensorDict({"action": torch.ones(7)}))["action"]
-        tensor([0.5000, 0.5000, 0.5000, 0.5000, 0.5000, 0.5000, 1.0000])
-    """
-
-    def __init__(
-        self,
-        *,
-        magnitude: tuple[float, float] = (1.0, 1.0),
-        max_angle: float = 0.0,
-        per: str = "step",
-    ) -> None:
-        if not 0 <= magnitude[0] <= magnitude[1]:
-            raise BMRLError(f"magnitude is {magnitude}; valid: two rising numbers of at least 0")
-        if not 0 <= max_angle <= 180:
-            raise BMRLError(f"max_angle is {max_angle}; valid: between 0 and 180 degrees")
-        if per not in ("step", "episode"):
-            raise UnknownNameError("per", per, ("step", "episode"))
-        super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
-        self.magnitude = magnitude
-        self.max_angle = math.radians(max_angle)
-        self.per = per
-        self._drawn: tuple[Tensor, Tensor, Tensor] | None = None
-
-    def _draw(self, shape: torch.Size) -> tuple[Tensor, Tensor, Tensor]:
-        low, high = self.magnitude
-        factor = low + (high - low) * torch.rand(*shape, 1)
-        return factor, self.max_angle * torch.rand(*shape, 1), torch.randn(*shape, 3)
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        if self.per == "episode":
-            drawn = self._draw(tensordict_reset.batch_size)
-            mask = None if tensordict is None else tensordict.get("_reset", None)
-            if self._drawn is not None and mask is not None:
-                anew = mask.reshape(*tensordict_reset.batch_size, 1)
-                pairs = zip(drawn, self._drawn, strict=True)
-                drawn = tuple(torch.where(anew, new, old) for new, old in pairs)  # type: ignore[assignment]
-            self._drawn = drawn
-        return tensordict_reset
-
-    def _inv_apply_transform(self, action: Tensor) -> Tensor:
-        drawn = self._draw(action.shape[:-1]) if self._drawn is None else self._drawn
-        factor, angle, towards = drawn
-        motion, turn, gripper = action.split((3, 3, action.shape[-1] - 6), -1)
-        moved = tilt(motion, towards.to(action), angle.to(action))
-        perturbed = torch.cat([factor * moved, factor * turn], -1).clamp(-1.0, 1.0)
-        return torch.cat([perturbed.to(action), gripper], -1)
-
-
-def tilt(vector: Tensor, towards: Tensor, angle: Tensor) -> Tensor:
-    """Turns vectors by an angle towards other ones; their lengths stay.
-
-    Args:
-        vector: ``(*B, 3)``.
-        towards: ``(*B, 3)``; not parallel to ``vector``.
-        angle: ``(*B, 1)`` [rad].
-
-    Example:
-        >>> x, y = torch.eye(3)[:2]
-        >>> tilt(2 * x, x + y, torch.tensor([torch.pi / 2])).round(decimals=4).abs()
-        tensor([0., 2., 0.])
-    """
-    length = vector.norm(dim=-1, keepdim=True)
-    unit = vector / length.clamp_min(1e-12)
-    across = towards - (towards * unit).sum(-1, keepdim=True) * unit
-    across = across / across.norm(dim=-1, keepdim=True).clamp_min(1e-12)
-    return length * (angle.cos() * unit + angle.sin() * across)
-
-
 class StageReward(Transform):
-    """Rewards what a composition has done, and nothing else: +1 for each stage completed.
+    """Rewards each completed stage of a composition with +1, and nothing else.
 
-    Reads ``stage (*B,)`` before and after a step. Writes ``("next", "reward") (*B, 1)`` and, so
-    that an agent knows what is left to do, ``progress (*B, 1)``: the share of stages done.
+    Reads ``stage (*B,)`` before and after a step. Writes ``("next", "reward") (*B, 1)`` and
+    ``progress (*B, 1)``, the share of completed stages, for the agent's observation.
 
     Args:
-        num_stages: tasks of the composition.
+        num_stages: number of the composition's tasks.
 
     Raises:
-        BMRLError: for fewer than one.
+        BMRLError: for ``num_stages`` below one.
 
     Example:
         >>> from tensordict import TensorDict
@@ -197,7 +106,7 @@ class StageReward(Transform):
         return self._call(tensordict_reset)
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        """Rewards are whole numbers of stages."""
+        """Rewards are numbers of stages."""
         reward_spec["reward"] = Bounded(0, self.num_stages, (*reward_spec.shape, 1))
         return reward_spec
 
@@ -281,16 +190,16 @@ def make_observation_transform(
     parts: Sequence[str] | None = None,
     cast: bool = True,
 ) -> Compose:
-    """Transform from the named parts to ``observation (n,)`` float32, normalised if asked to.
+    """Returns the transform from the named parts to ``observation (n,)`` float32.
 
-    It serves environments (append it) and stored data (call it) alike.
+    Append it to an environment, or call it on stored data.
 
     Args:
-        task: whose observation.
-        statistics: of the normalisation; ``None`` leaves the observation as it is.
-        parts: names to concatenate, for a task without transforms of its own; by default those of
-            the statistics or of the task.
-        cast: whether to cast float64; TorchRL refuses to cast an environment's float32.
+        task: the task.
+        statistics: statistics of the normalisation; ``None`` for no normalisation.
+        parts: names to concatenate, for a task without its own transforms; by default those of the
+            statistics or of the task.
+        cast: whether to cast float64 to float32; TorchRL cannot cast a float32 environment.
 
     Example:
         >>> from tensordict import TensorDict
@@ -328,12 +237,12 @@ def transform_data(
 
     Args:
         data: batch ``[N]`` with the named parts.
-        task: whose observation.
-        statistics: of the normalisation.
+        task: the task.
+        statistics: statistics of the normalisation.
 
     Returns:
-        batch ``[N]`` with ``observation (N, n)`` in place of the parts, now and under ``"next"``,
-        and the other keys of ``data``.
+        batch ``[N]`` with ``observation (N, n)`` instead of the parts, also under ``"next"``, and
+        the other keys of ``data``.
     """
     transform = make_observation_transform(task, statistics)
     after = transform(data.get("next").copy())
@@ -347,15 +256,15 @@ def make_env(
     num_envs: int | None = None,
     **options: Any,
 ) -> TransformedEnv:
-    """A task as a TorchRL environment with ``observation (n,)``.
+    """Returns a task's TorchRL environment with ``observation (n,)``.
 
     Args:
-        task: a task, or the name of a registered one or of a composition.
-        statistics: of the normalisation.
-        *transforms: appended, such as a source of ``task_latent``.
-        num_envs: number of episodes side by side, batch ``[num_envs]``; ``None`` for one without
-            a batch dimension.
-        **options: of the task's environment, in place of the task's own.
+        task: a task, or the name of a registered task or a composition.
+        statistics: statistics of the normalisation; ``None`` for no normalisation.
+        *transforms: appended transforms, such as a source of ``task_latent``.
+        num_envs: number of parallel episodes, batch ``[num_envs]``; ``None`` for one without a
+            batch dimension.
+        **options: options of the environment, which replace those of the task.
 
     Raises:
         UnknownNameError: for a name that is not registered.
@@ -390,7 +299,7 @@ def make_env(
 def _check_observation(
     task: Task, env: EnvBase, statistics: ObservationStatistics, transform: Compose
 ) -> None:
-    """Refuses an environment whose observation is not that of the demonstrations."""
+    """Raises an error if an environment's observation differs from that of the demonstrations."""
     spec = env.observation_spec
     try:
         size = transform(spec.zero())["observation"].shape[-1]
@@ -403,5 +312,5 @@ def _check_observation(
     if size != len(statistics.loc):
         raise ConfigError(
             f"the environment of task {task.name} has {size} observed numbers; valid: "
-            f"{len(statistics.loc)}, as its demonstrations"
+            f"{len(statistics.loc)}, as in its demonstrations"
         )

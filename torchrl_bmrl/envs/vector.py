@@ -21,8 +21,8 @@ class TabletopVectorEnv(VectorEnv):
     """``num_envs`` episodes of the same skills; each costs the memory of its state, 3 kB.
 
     One :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv` plays them in turn and restores the state
-    of each. A policy acts in all of them with one call. Each episode equals that of a
-    ``TabletopEnv`` of its own to the bit.
+    of each, so that a policy acts in all of them with one call. Each episode equals that of a
+    separate ``TabletopEnv`` to the bit.
 
     Episodes are not reset automatically (``AutoresetMode.DISABLED``, as TorchRL's ``GymWrapper``
     expects).
@@ -72,14 +72,13 @@ class TabletopVectorEnv(VectorEnv):
         """Starts episodes.
 
         Args:
-            seed: a sequence with one for each episode, or that of the first; the others then count
-                up from it.
+            seed: a seed for each episode, or one number s for the seeds s, s + 1, ...
             options: ``{"reset_mask": mask}`` starts only the episodes of a mask ``(num_envs,)``;
                 ``{"states": states}`` continues from states of :meth:`get_states`.
 
         Raises:
-            BMRLError: if the number of seeds or states is not that of the episodes, or a state is
-                not valid; no episode changes then.
+            BMRLError: if the number of seeds or states is not ``num_envs``, or a state is not
+                valid; no episode changes then.
         """
         options = options or {}
         if seed is None or isinstance(seed, int | np.integer):
@@ -92,13 +91,13 @@ class TabletopVectorEnv(VectorEnv):
                     f"{len(rows)} {name} for {self.num_envs} environments; valid: one for each"
                 )
         if any(now is None for now, starts in zip(self._states, mask, strict=True) if not starts):
-            raise BMRLError("reset_mask leaves out episodes that never started")
+            raise BMRLError("reset_mask leaves out episodes that have not started")
         shown, started = list(self._shown), list(self._states)
         for i in np.flatnonzero(mask):
             wanted = None if states[i] is None else {"state": states[i]}
             shown[i] = self._env.reset(seed=seed[i], options=wanted)
             started[i] = self._env.get_state()
-        self._shown, self._states = shown, started  # only now: a state may be refused
+        self._shown, self._states = shown, started  # last, since set_state may raise an error
         observations, infos = zip(*self._shown, strict=True)
         return _stack(observations), _stack(infos)
 
@@ -111,7 +110,7 @@ class TabletopVectorEnv(VectorEnv):
             actions: ``(num_envs, 7)``.
 
         Raises:
-            BMRLError: if the shape is another one or an action is not finite; nothing moves then.
+            BMRLError: if the shape differs or an action is not finite; no step is made then.
         """
         actions = np.asarray(actions, dtype=np.float64)
         if actions.shape != self.action_space.shape or not np.isfinite(actions).all():
@@ -132,7 +131,7 @@ class TabletopVectorEnv(VectorEnv):
         )
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """Picture of each episode, as ``TabletopEnv.render`` gives it; ``None`` without a mode.
+        """Renders each episode like ``TabletopEnv.render``; ``None`` without ``render_mode``.
 
         Raises:
             BMRLError: before the first reset.
@@ -146,7 +145,7 @@ class TabletopVectorEnv(VectorEnv):
         return tuple(pictures)
 
     def get_states(self) -> list[dict[str, np.ndarray]]:
-        """State of each episode, as ``TabletopEnv.get_state`` gives it.
+        """Returns the state of each episode, as from ``TabletopEnv.get_state``.
 
         Raises:
             BMRLError: before the first reset.
@@ -156,7 +155,7 @@ class TabletopVectorEnv(VectorEnv):
 
     def _state(self, i: int) -> dict[str, np.ndarray]:
         if (state := self._states[i]) is None:
-            raise BMRLError("an episode starts with reset")
+            raise BMRLError("an episode has not started; valid: call reset first")
         return state
 
     def close_extras(self, **kwargs: Any) -> None:

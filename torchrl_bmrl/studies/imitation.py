@@ -21,7 +21,8 @@ from torchrl.modules import MLP
 
 from torchrl_bmrl.data.episodes import as_tensordict
 from torchrl_bmrl.data.robomimic import keep_episode, read_kept_episode
-from torchrl_bmrl.envs.transforms import PerturbAction, transform_data
+from torchrl_bmrl.envs.perturbation import PerturbAction
+from torchrl_bmrl.envs.transforms import transform_data
 from torchrl_bmrl.errors import BMRLError, ConfigError
 from torchrl_bmrl.evaluation import bootstrap_interval
 from torchrl_bmrl.files import read_rows, whole, write_rows
