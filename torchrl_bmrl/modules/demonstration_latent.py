@@ -8,7 +8,12 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS, PrototypeTaskLatent, last_transition
+from torchrl_bmrl.modules.task_latent import (
+    TRANSITION_KEYS,
+    PrototypeTaskLatent,
+    last_transition,
+    only_in_environments,
+)
 
 ALIGNMENTS = ("time", "state", "progress")
 """How the embeddings follow an episode; see :class:`DemonstrationTaskLatent`."""
@@ -158,10 +163,4 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
         self._position = position
         return self._write(next_tensordict)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Not defined outside an environment: the alignment needs an episode.
-
-        Raises:
-            BMRLError: always.
-        """
-        raise BMRLError("DemonstrationTaskLatent acts in an environment, not on stored data")
+    forward = only_in_environments

@@ -10,6 +10,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.modules.task_latent import only_in_environments
 
 
 def task_latent_box(task_latent: Tensor, *, share: float = 0.98) -> tuple[Tensor, Tensor]:
@@ -144,13 +145,7 @@ class HeldTaskLatent(Transform):
         steps = torch.zeros((*tensordict_reset.batch_size, 1), dtype=torch.int64)
         return tensordict_reset.set("held_steps", steps)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Not defined outside an environment.
-
-        Raises:
-            BMRLError: always.
-        """
-        raise BMRLError("HeldTaskLatent acts in an environment, not on stored data")
+    forward = only_in_environments
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """The action becomes m, within the box."""

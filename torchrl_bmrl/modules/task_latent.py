@@ -184,6 +184,15 @@ def last_transition(tensordict: TensorDictBase, next_tensordict: TensorDictBase)
     )
 
 
+def only_in_environments(self: Transform, tensordict: TensorDictBase) -> TensorDictBase:
+    """Not defined outside an environment, because the transform needs an episode.
+
+    Raises:
+        BMRLError: always.
+    """
+    raise BMRLError(f"{type(self).__name__} acts in an environment, not on stored data")
+
+
 class OnlineTaskLatent(PrototypeTaskLatent):
     """Writes the embedding of the last transition; the prototype at the first step.
 
@@ -286,10 +295,4 @@ class PathTaskLatent(PrototypeTaskLatent):
         self._time = self._time + 1
         return self._write(next_tensordict)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Not defined outside an environment: a path needs an episode.
-
-        Raises:
-            BMRLError: always.
-        """
-        raise BMRLError("PathTaskLatent acts in an environment, not on stored data")
+    forward = only_in_environments

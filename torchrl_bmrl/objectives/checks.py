@@ -22,13 +22,6 @@ def whole_signature(cls: type, without: Sequence[str] = ()) -> inspect.Signature
     Args:
         cls: whose ``__init__`` passes ``**options`` on to its base.
         without: options of the base that the class does not accept.
-
-    Example:
-        >>> from torchrl_bmrl.objectives import OfflineLoss
-        >>> class Mine(OfflineLoss):
-        ...     def __init__(self, network, *, gamma=0.9, **options): ...
-        >>> list(inspect.signature(Mine).parameters)[:3]
-        ['network', 'gamma', 'loss_function']
     """
     own = inspect.signature(cls.__init__)  # type: ignore[misc]
     _, *parameters = own.parameters.values()
@@ -63,10 +56,6 @@ def check_number(
 
     Raises:
         BMRLError: for anything else.
-
-    Example:
-        >>> check_number("lmbda", 0.75, 0.0, 1.0)
-        0.75
     """
     if value is None and optional:
         return value
@@ -121,11 +110,6 @@ def leaf_of(spec: Any, key: NestedKey) -> Any:
 
     Raises:
         BMRLError: for a composite spec with several entries, none of them under the key.
-
-    Example:
-        >>> from torchrl.data import Composite, OneHot
-        >>> leaf_of(Composite(agent=Composite(move=OneHot(4))), "action").space.n
-        4
     """
     if not isinstance(spec, Composite):
         return spec

@@ -20,12 +20,7 @@ TOLERANCE = 1e-3
 
 
 def next_key(key: NestedKey) -> tuple[str, ...]:
-    """The key under ``"next"``.
-
-    Example:
-        >>> next_key("reward"), next_key(("agent", "reward"))
-        (('next', 'reward'), ('next', 'agent', 'reward'))
-    """
+    """The key under ``"next"``."""
     return ("next", key) if isinstance(key, str) else ("next", *key)
 
 
@@ -58,10 +53,6 @@ def entry(
 
     Raises:
         BMRLError: if it is missing, or contains NaN or infinity.
-
-    Example:
-        >>> entry(TensorDict({"reward": torch.tensor([1.0])}, []), "reward")
-        tensor([1.])
     """
     value = tensordict.get(key, None)
     if value is None:
@@ -74,8 +65,7 @@ def entry(
     # The sum is cheap; it is infinite or NaN wherever a number is, and rarely otherwise.
     if value.is_floating_point() and not isfinite(value.sum().item()):
         infinite = ~value.isfinite()
-        if infinite.any():
-            first = _first(infinite)
+        if (first := _first(infinite)) is not None:
             raise BMRLError(
                 f"{key!r} holds {int(infinite.sum())} numbers that are not finite, the first, "
                 f"{value[first].item()}, at {first}; valid: finite numbers"
@@ -177,13 +167,6 @@ def check_one_hot(key: NestedKey, action: Tensor, valid: Tensor | None) -> None:
 
     Raises:
         BMRLError: naming the first row that names no action, or several.
-
-    Example:
-        >>> check_one_hot("action", torch.tensor([[0.0, 0.999], [0.9, 0.1]]), None)
-        >>> check_one_hot("action", torch.tensor([[0.5, 0.5]]), None)
-        Traceback (most recent call last):
-        ...
-        torchrl_bmrl.errors.BMRLError: 'action' names no single action in 1 rows, the first, ...
     """
     if not readable(action):
         return
@@ -191,10 +174,7 @@ def check_one_hot(key: NestedKey, action: Tensor, valid: Tensor | None) -> None:
     largest = weight.amax(-1)
     others = weight.abs().sum(-1) - largest
     unclear = ~((largest > 0.5) & (others < 0.5))
-    if valid is not None:
-        unclear &= valid
-    if unclear.any():
-        first = _first(unclear)
+    if (first := _first(unclear, valid)) is not None:
         raise BMRLError(
             f"{key!r} names no single action in {int(unclear.sum())} rows, the first, "
             f"{action[first].tolist()}, at {first}; valid: rows with one entry near 1 and the "
@@ -216,13 +196,6 @@ def check_within(
 
     Raises:
         BMRLError: naming the first number outside, or for bounds of another length.
-
-    Example:
-        >>> low, high = torch.tensor(-1.0), torch.tensor(1.0)
-        >>> check_within("action", torch.tensor([[0.5, 1.9]]), low, high, None)
-        Traceback (most recent call last):
-        ...
-        torchrl_bmrl.errors.BMRLError: 'action' holds 1 numbers outside the bounds, the first, ...
     """
     if low.ndim and low.shape != action.shape[-1:]:
         raise BMRLError(
@@ -235,10 +208,7 @@ def check_within(
         return
     slack = TOLERANCE * (high - low)
     outside = (action < low - slack) | (action > high + slack)
-    if valid is not None:
-        outside &= valid.unsqueeze(-1)
-    if outside.any():
-        first = _first(outside)
+    if (first := _first(outside, None if valid is None else valid.unsqueeze(-1))) is not None:
         raise BMRLError(
             f"{key!r} holds {int(outside.sum())} numbers outside the bounds, the first, "
             f"{action[first].item():g}, at {first}; valid: {low.tolist()} to {high.tolist()}, or "
@@ -257,13 +227,6 @@ def check_tasks(key: NestedKey, task: Tensor, shape: torch.Size, valid: Tensor |
 
     Raises:
         BMRLError: for another shape or type, or naming the first row with another task.
-
-    Example:
-        >>> check_tasks("task", torch.tensor([[0, 0], [1, 1]]), torch.Size([2, 2]), None)
-        >>> check_tasks("task", torch.tensor([[0, 1], [0, 1]]), torch.Size([2, 2]), None)
-        Traceback (most recent call last):
-        ...
-        torchrl_bmrl.errors.BMRLError: 'task' holds 1 in row 0; valid: 0 there, since row i of ...
     """
     if task.shape != shape:
         raise BMRLError(f"{key!r} has the shape {tuple(task.shape)}; valid: {tuple(shape)}")
@@ -271,16 +234,16 @@ def check_tasks(key: NestedKey, task: Tensor, shape: torch.Size, valid: Tensor |
     if not readable(task):
         return
     wrong = task != torch.arange(len(task), device=task.device).unsqueeze(-1)
-    if valid is not None:
-        wrong &= valid
-    if wrong.any():
-        row, column = _first(wrong)
+    if (first := _first(wrong, valid)) is not None:
+        row, column = first
         raise BMRLError(
             f"{key!r} holds {int(task[row, column])} in row {row}; valid: {row} there, since row i "
             "of the data belongs to the i-th teacher's task"
         )
 
 
-def _first(flags: Tensor) -> tuple[int, ...]:
-    """Index of the first true entry."""
-    return tuple(flags.nonzero()[0].tolist())
+def _first(flags: Tensor, valid: Tensor | None = None) -> tuple[int, ...] | None:
+    """Index of the first true entry in the rows that count, which it sets to false elsewhere."""
+    if valid is not None:
+        flags &= valid
+    return tuple(flags.nonzero()[0].tolist()) if flags.any() else None

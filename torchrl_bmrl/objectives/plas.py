@@ -55,9 +55,7 @@ class PLASLoss(GenerativeLoss):
         lmbda: λ, weight of the critics' minimum against their maximum.
         **options: as for :class:`~torchrl_bmrl.objectives.BCQLoss`, but no ``latent_clip``.
 
-    Keys read: ``observation (*B, obs_dim)``, ``action (*B, action_dim)``, and under ``"next"``
-    ``observation``, ``reward``, ``done``, ``terminated``, each of the last three ``(*B, 1)``.
-    Key written to the input: ``td_error (*B,)``, the priority.
+    Keys read and written: as :class:`~torchrl_bmrl.objectives.BCQLoss`.
 
     Raises:
         BMRLError: as :class:`~torchrl_bmrl.objectives.BCQLoss`.

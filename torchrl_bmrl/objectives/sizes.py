@@ -26,13 +26,6 @@ def agreed_sizes(networks: Iterable[tuple[str, Any]]) -> dict[NestedKey, int]:
 
     Raises:
         BMRLError: if two of them declare different sizes of one entry.
-
-    Example:
-        >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
-        >>> agreed_sizes([("generator", ActionVAE(3, 2)), ("critic", make_qvalue_network(3, 1))])
-        Traceback (most recent call last):
-        ...
-        torchrl_bmrl.errors.BMRLError: 'action' has the size 2 in generator and 1 in critic; ...
     """
     known: dict[NestedKey, tuple[str, int]] = {}
     for name, network in networks:

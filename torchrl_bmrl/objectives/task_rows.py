@@ -13,10 +13,6 @@ def draw_rows(task_latent: Tensor, valid: Tensor | None, number: int) -> Tensor:
         task_latent: m, ``(num_tasks, B, m)``.
         valid: which rows count, ``(num_tasks, B)``; ``None`` if all do.
         number: of rows to draw.
-
-    Example:
-        >>> draw_rows(torch.zeros(3, 5, 2), None, 8).shape
-        torch.Size([3, 5, 8, 2])
     """
     num_tasks, rows, size = task_latent.shape
     if valid is None:
@@ -39,11 +35,6 @@ def draw_others(task_latent: Tensor, valid: Tensor | None) -> tuple[Tensor, Tens
 
     Returns:
         two tensors ``(num_tasks, B, m)``.
-
-    Example:
-        >>> near, far = draw_others(torch.arange(6.0).view(2, 3, 1), None)
-        >>> bool((near[0] < 3).all()), bool((far[0] >= 3).all())
-        (True, True)
     """
     num_tasks, rows = task_latent.shape[:2]
     device = task_latent.device

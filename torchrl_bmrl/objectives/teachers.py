@@ -76,10 +76,6 @@ def per_task(name: str, values: Any, default: Tensor) -> Tensor:
 
     Raises:
         BMRLError: for another shape, or numbers that are not valid.
-
-    Example:
-        >>> per_task("qvalue_loc", [1, 2], torch.zeros(2))
-        tensor([1., 2.])
     """
     tensor = default if values is None else torch.as_tensor(values).to(default)
     scale = name.endswith("scale")
