@@ -129,7 +129,18 @@ def described(name: str) -> Iterator[tuple[str, FunctionType, str]]:
     """The functions of a module with the docstrings that describe their parameters and errors."""
     for key, function in functions(name).items():
         owner, _, method = key.rpartition(".")
-        yield key, function, docstring(members(name)[owner] if method == "__init__" else function)
+        if method == "__init__":
+            yield key, function, docstring(members(name)[owner])
+            continue
+        bases = members(name)[owner].__mro__ if owner else ()
+        # What a method overrides describes its parameters, too.
+        overridden = [vars(base)[method] for base in bases[1:] if method in vars(base)]
+        own = [
+            each
+            for each in overridden
+            if getattr(each, "__module__", "").startswith("torchrl_bmrl")
+        ]
+        yield key, function, "\n".join([docstring(function), *map(docstring, own)])
 
 
 def section(text: str, *titles: str) -> str:

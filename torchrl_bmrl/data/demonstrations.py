@@ -147,7 +147,17 @@ def write_statistics(data_dir: Path, tasks: Sequence[Task]) -> ObservationStatis
     Raises:
         DataError: for files that :func:`read_demonstrations` refuses, and for tasks whose
             observations or actions differ in size or parts.
+
+    Example:
+        >>> import tempfile
+        >>> try:
+        ...     write_statistics(Path(tempfile.mkdtemp()), [])
+        ... except DataError as error:
+        ...     print(error.message)
+        no tasks; valid: at least one
     """
+    if not tasks:
+        raise DataError(data_dir, None, "no tasks; valid: at least one")
     raw = [
         read_demonstrations(
             demonstration_path(data_dir, task.name), task, split="train", index=index
@@ -232,6 +242,27 @@ def load_transitions(
 
     Raises:
         DataError: for a file that :func:`read_demonstrations` refuses.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl_bmrl.data import Episode
+        >>> from torchrl_bmrl.data.robomimic import write_episodes
+        >>> from torchrl_bmrl.tasks import DemonstrationFiles
+        >>> parts = {"arm": np.zeros((5, 7))}
+        >>> episode = Episode(
+        ...     observations=parts,
+        ...     next_observations=parts,
+        ...     actions=np.zeros((5, 2)),
+        ...     rewards=np.zeros(5),
+        ...     terminated=np.zeros(5, bool),
+        ... )
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> write_episodes(folder / "door.hdf5", [episode], env_args={}, masks={"train": [0]})
+        >>> task = Task(name="door", files=DemonstrationFiles(path="door.hdf5"))
+        >>> statistics = write_statistics(folder, [task])
+        >>> data = load_transitions(folder, task, statistics, split="train", index=0)
+        >>> data["next", "observation"].shape
+        torch.Size([5, 7])
     """
     path = demonstration_path(data_dir, task.name)
     data = read_demonstrations(path, task, split=split, index=index)

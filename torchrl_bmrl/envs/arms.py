@@ -52,6 +52,12 @@ def inverse_kinematics(
 
     Raises:
         BMRLError: if no joints are found.
+
+    Example:
+        >>> from torchrl_bmrl.envs.scene import TabletopScene
+        >>> scene = TabletopScene("reach", seed=0)
+        >>> inverse_kinematics(scene, scene.eef_position + 0.01).shape
+        (7,)
     """
     robot, model = env.robots[0], env.sim.model._model
     scratch = mujoco.MjData(model)
@@ -90,6 +96,11 @@ class Gripper:
         open_command: ``current_action`` when an episode starts.
         open_fingers: finger joints at rest under it, (k,) [m] or [rad].
         open_gap: :attr:`gap` of these [m].
+
+    Example:
+        >>> from torchrl_bmrl.envs.scene import TabletopScene
+        >>> TabletopScene("lift", robots="Panda").gripper.open_fingers.shape
+        (2,)
     """
 
     def __init__(self, env: Any) -> None:
@@ -160,7 +171,11 @@ class Gripper:
         return float(np.linalg.norm(left - right))
 
     def touches(self, geom: int) -> bool:
-        """Whether both sides' finger pads touch a geom."""
+        """Whether both sides' finger pads touch a geom.
+
+        Args:
+            geom: MuJoCo's number of the geom.
+        """
         touching = self._env.sim.data._data.contact.geom
         others = touching[(touching == geom).any(1)]
         return all(bool(np.isin(others, pads).any()) for pads in self._pads)

@@ -43,6 +43,11 @@ def why_not_fast(env: MujocoEnv) -> Obstacle | None:
 
     Args:
         env: robosuite environment without wrappers.
+
+    Example:
+        >>> from torchrl_bmrl.envs.scene import TabletopScene
+        >>> why_not_fast(TabletopScene("lift")) is None
+        True
     """
     return settings_obstacle(env) or _model_obstacle(env)
 

@@ -53,6 +53,10 @@ def robosuite_metadata(
         skills: as for :class:`TabletopScene`.
         robot: the arm.
         gripper: as for :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`.
+
+    Example:
+        >>> robosuite_metadata("push_up")["env_name"]
+        'BMRLSawyerPush'
     """
     described = [describe_skill(skill) for skill in make_skills(skills)]
     name: str = "TabletopScene"

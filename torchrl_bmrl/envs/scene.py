@@ -85,6 +85,12 @@ class TabletopScene(ManipulationEnv):
 
     Raises:
         UnknownNameError: for a skill or an arm that does not exist.
+
+    Example:
+        >>> scene = TabletopScene("reach-lift", robots="Panda", seed=0)
+        >>> _ = scene.reset()
+        >>> scene.skill.name, scene.goal.shape
+        ('reach', (3,))
     """
 
     def __init__(
@@ -152,7 +158,11 @@ class TabletopScene(ManipulationEnv):
         )
 
     def edit_model_xml(self, xml_str: str) -> str:
-        """robosuite's changes, and the leaner model if asked for."""
+        """Applies robosuite's changes, and removes what only cameras see if ``lean`` is set.
+
+        Args:
+            xml_str: MJCF of the scene.
+        """
         self._scene = super().edit_model_xml(xml_str)
         return without_pictures(self._scene) if self.lean else self._scene
 
@@ -280,7 +290,11 @@ class TabletopScene(ManipulationEnv):
         return self.skill.reward_terms(self)
 
     def reward(self, action: np.ndarray | None = None) -> float:
-        """Sum of :meth:`reward_terms`."""
+        """Sum of :meth:`reward_terms`.
+
+        Args:
+            action: robosuite's argument; the reward does not depend on it.
+        """
         return sum(self.reward_terms().values())
 
     # -- state ---------------------------------------------------------------------------------
@@ -296,7 +310,11 @@ class TabletopScene(ManipulationEnv):
         return state
 
     def set_episode_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Restores what :meth:`episode_state` returned."""
+        """Restores the state of an episode.
+
+        Args:
+            state: of :meth:`episode_state`.
+        """
         self.goal_start = state["goal_start"]
         if len(self.skills) > 1:
             self.stage = int(state["stage"][0])

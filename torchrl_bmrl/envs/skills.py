@@ -102,7 +102,11 @@ class Skill:
     name: ClassVar[Any]
 
     def start(self, scene: TabletopScene) -> np.ndarray:
-        """End-effector position at the start of an episode, (3,) [m]."""
+        """End-effector position at the start of an episode, (3,) [m].
+
+        Args:
+            scene: with the cube in its place.
+        """
         return scene.above_cube
 
     def begin(self, scene: TabletopScene, following: Skill | None) -> np.ndarray:
@@ -115,19 +119,35 @@ class Skill:
         return scene.cube_on_table
 
     def goal(self, scene: TabletopScene) -> np.ndarray:
-        """The observation's ``goal_pos``, (3,) [m]."""
+        """The observation's ``goal_pos``, (3,) [m].
+
+        Args:
+            scene: in its present state.
+        """
         return scene.cube_position
 
     def reach_term(self, scene: TabletopScene) -> float:
-        """:func:`reach_reward` of the end-effector's distance to :meth:`goal`."""
+        """:func:`reach_reward` of the end-effector's distance to :meth:`goal`.
+
+        Args:
+            scene: in its present state.
+        """
         return reach_reward(float(np.linalg.norm(scene.eef_position - self.goal(scene))))
 
     def reward_terms(self, scene: TabletopScene) -> dict[str, float]:
-        """Values of :attr:`terms`; the reward is their sum."""
+        """Values of :attr:`terms`; the reward is their sum.
+
+        Args:
+            scene: in its present state.
+        """
         raise NotImplementedError
 
     def success(self, scene: TabletopScene) -> bool:
-        """Whether the skill succeeds now."""
+        """Whether the skill succeeds now.
+
+        Args:
+            scene: in its present state.
+        """
         raise NotImplementedError
 
 

@@ -171,6 +171,9 @@ class TabletopEnv(gymnasium.Env):
     ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Acts for one control period (50 ms).
 
+        Args:
+            action: (7,) in [-1, 1].
+
         Raises:
             BMRLError: if the action has another shape or is not finite; no step is made then.
         """
@@ -233,6 +236,9 @@ class TabletopEnv(gymnasium.Env):
 
         The episode continues exactly, with the skill of this environment. States of lift and of the
         four pushes fit each other's environments.
+
+        Args:
+            state: arrays by name.
 
         Raises:
             BMRLError: if an array is missing, unknown, of another shape or not finite; the

@@ -176,7 +176,20 @@ class ObservationStatistics:
 
 
 def observation_parts(task: Task, data: TensorDictBase) -> tuple[str, ...] | None:
-    """Names of the parts that are concatenated; ``None`` for a task with its own transforms."""
+    """Names of the parts that are concatenated; ``None`` for a task with its own transforms.
+
+    Args:
+        task: the task.
+        data: transitions with the parts, now and under ``"next"``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_bmrl.tasks import DemonstrationFiles, Task
+        >>> task = Task(name="door", files=DemonstrationFiles(path="door.hdf5"))
+        >>> parts = {"arm": torch.zeros(4, 7)}
+        >>> observation_parts(task, TensorDict({**parts, "next": parts}, [4]))
+        ('arm',)
+    """
     if task.observation is not None:
         return None
     following = data.get("next").keys()
@@ -243,6 +256,16 @@ def transform_data(
     Returns:
         batch ``[N]`` with ``observation (N, n)`` instead of the parts, also under ``"next"``, and
         the other keys of ``data``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_bmrl.tasks import DemonstrationFiles, Task
+        >>> task = Task(name="door", files=DemonstrationFiles(path="door.hdf5"))
+        >>> parts = {"arm": torch.zeros(4, 7)}
+        >>> statistics = ObservationStatistics(torch.zeros(7), torch.ones(7), ("arm",))
+        >>> data = transform_data(TensorDict({**parts, "next": parts}, [4]), task, statistics)
+        >>> data["next", "observation"].shape
+        torch.Size([4, 7])
     """
     transform = make_observation_transform(task, statistics)
     after = transform(data.get("next").copy())

@@ -167,6 +167,10 @@ def observation_transforms() -> list[Transform]:
 
     Joint positions become their sines and cosines. For an arm with n joints and a gripper with k,
     ``observation`` has 3n + k + 10 numbers: 33 for Sawyer.
+
+    Example:
+        >>> [type(transform).__name__ for transform in observation_transforms()]
+        ['SinCosTransform', 'CatTensors']
     """
     from torchrl.envs.transforms import CatTensors
 
