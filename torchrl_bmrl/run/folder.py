@@ -124,6 +124,9 @@ def deciding(settings: Mapping[str, Any]) -> dict[str, Any]:
 def read_settings(run_dir: Path) -> dict[str, Any]:
     """Returns the settings of a run folder, nested as in ``config.yaml``.
 
+    Args:
+        run_dir: the run folder.
+
     Raises:
         DataError: if the file is missing or not YAML.
 
@@ -175,6 +178,9 @@ class _Loader(yaml.SafeLoader):
 
 def read_versions(run_dir: Path) -> dict[str, str]:
     """Returns the versions that a run uses, by package and for ``python``; some may be ``"None"``.
+
+    Args:
+        run_dir: the run folder.
 
     Raises:
         DataError: if ``versions.json`` is missing or damaged.
