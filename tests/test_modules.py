@@ -25,6 +25,7 @@ from helpers import (
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
+from torch.utils.flop_counter import FlopCounterMode
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
@@ -821,6 +822,16 @@ def test_a_state_shared_by_its_candidates_gives_the_same_output_and_gradients(
     assert results[0][0].shape == (*batch, 5, 2)
     for ours, expected in zip(*results, strict=True):
         torch.testing.assert_close(ours, expected, rtol=1e-10, atol=1e-12)
+
+
+def test_a_state_shared_by_its_candidates_enters_the_first_layer_once() -> None:
+    inputs, copies = candidate_inputs(4, parts=2)
+    counts = []
+    for given in (inputs, copies):
+        with FlopCounterMode(display=False) as counter, torch.no_grad():
+            a_mlp()(*given)
+        counts.append(counter.get_total_flops())
+    assert counts[1] - counts[0] == 2 * 4 * (5 - 1) * 6 * 16  # states, candidates, inputs, cells
 
 
 def test_networks_under_vmap_give_what_each_gives_alone() -> None:

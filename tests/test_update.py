@@ -332,13 +332,13 @@ class Waiting(TorchDispatchMode):
 def test_an_update_never_waits_for_its_device(
     members: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from torchrl_bmrl.objectives import checks
+    from torchrl_bmrl.objectives import data as checked
 
     _, update = bcq_update(members, **({"deactivate_vmap": False} if members else {}))
     batch = bcq_batch(members, 0)
     with pytest.raises(AssertionError, match="_local_scalar_dense"), Waiting():
         update(batch)  # on CPU the data are looked at
-    monkeypatch.setattr(checks, "readable", lambda value: False)  # as on another device
+    monkeypatch.setattr(checked, "readable", lambda value: False)  # as on another device
     with Waiting():
         update(batch)
 

@@ -46,8 +46,8 @@ class CandidateMLP(MLP):
         else:
             whole = torch.cat(inputs, -1) if len(inputs) > 1 else inputs[0]
             shape = whole.shape[:-1]
-            # In rows: else the layer's output is a view, and to change a view in place, as ReLU
-            # does here, costs several copies in the gradient.
+            # As rows: with more dimensions a layer's output is a view, and changing a view in
+            # place, as ReLU does here, costs several copies in the backward pass.
             hidden = first(whole.reshape(-1, whole.shape[-1]))
         for layer in rest:
             hidden = layer(hidden)
