@@ -131,7 +131,7 @@ def test_an_unknown_arm_is_answered_with_the_valid_ones() -> None:
     with pytest.raises(UnknownNameError, match=r"robot 'Pandar'.*Sawyer, Panda"):
         TabletopEnv("lift", robot="Pandar")
     lift, reach = get_task("lift"), get_task("reach").with_options(robot="Panda")
-    with pytest.raises(ConfigError, match="Panda, Sawyer; valid: one arm"):
+    with pytest.raises(ConfigError, match="Panda, Sawyer; valid: the same arm"):
         compose_tasks([lift, reach])
 
 

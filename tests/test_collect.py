@@ -256,7 +256,7 @@ def test_a_file_with_another_number_of_episodes_is_refused(collected: dict[str, 
     with pytest.raises(DataError) as caught:
         run(collected["reach"].parent, {"reach": 4})
     assert caught.value.path == collected["reach"]
-    assert "holds 3 episodes where 5 are asked for" in str(caught.value)
+    assert "contains 3 episodes; valid: 5" in str(caught.value)
     assert collected["reach"].read_bytes() == before
 
 

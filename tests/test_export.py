@@ -308,7 +308,7 @@ def refused() -> dict[str, tuple[Callable[[], Any], dict[str, Any], str]]:
         "key": (
             bcq,
             {"loc": LOC, "scale": SCALE, "observation_key": "pixels"},
-            r"observation_key is 'pixels'; valid: what the policy reads, \['observation'\]",
+            r"observation_key is 'pixels'; valid: keys of the policy, \['observation'\]",
         ),
         "zero": (
             bcq,

@@ -1,4 +1,4 @@
-"""Policies as ONNX files, which act without this library and without PyTorch."""
+"""Exports policies as ONNX files, which need neither this library nor PyTorch."""
 
 from __future__ import annotations
 
@@ -35,36 +35,35 @@ def export_policy(
     observation_key: NestedKey = "observation",
     metadata: Mapping[str, Any] | None = None,
 ) -> None:
-    """Writes a policy as an ONNX file, which acts with ONNX Runtime alone.
+    """Writes a policy as an ONNX file, which runs with ONNX Runtime alone.
 
-    Its inputs are the policy's ``in_keys``, nested keys joined by ``_``, with one batch dimension.
-    A :class:`~torchrl_bmrl.modules.BCQPolicy` has one more, ``action_latent (B, N, latent_dim)``,
-    a latent z for each candidate: whoever calls draws them, the file itself is deterministic. B and
-    N are free. The output is ``action (B, action_dim)``.
+    The inputs are the policy's ``in_keys``, nested keys joined by ``_``, with one batch dimension.
+    A :class:`~torchrl_bmrl.modules.BCQPolicy` also has the input ``action_latent (B, N,
+    latent_dim)``: the caller draws a latent z for each candidate, and the file is deterministic. B
+    and N are free. The output is ``action (B, action_dim)``.
 
-    ``policy`` in the file's metadata is a JSON text with the policy's ``kind`` and, for a
-    BCQPolicy, what the latents are drawn with: ``num_candidates``, ``latent_dim``, ``latent_clip``.
+    The metadata entry ``policy`` is a JSON text with the policy's ``kind`` and, for a BCQPolicy,
+    ``num_candidates``, ``latent_dim`` and ``latent_clip`` for drawing the latents.
 
-    A live policy is written as it is now. Needs the extra ``[export]``.
+    Needs the extra ``[export]``.
 
     Args:
-        policy: of networks that ``torch.export`` takes, as all of this library are.
+        policy: a policy whose networks ``torch.export`` supports, as it does all of this library's.
         path: the file.
-        example: what the policy reads, of any batch size, such as ``env.reset()``; shapes and types
-            alone matter.
+        example: the policy's input with any batch size, such as ``env.reset()``; only shapes and
+            types matter.
 
     Keyword Args:
-        loc: mean of the observation, ``(obs_dim,)``, where TorchRL's ``ObservationNorm(loc, scale,
-            standard_normal=True)`` was in front of the policy: the file reads the observation as
-            it was before that. ``None`` where there was none.
-        scale: likewise, its standard deviation.
-        observation_key: what they normalise.
-        metadata: JSON-compatible, added to what the file says of the policy.
+        loc: mean ``(obs_dim,)`` of TorchRL's ``ObservationNorm(loc, scale, standard_normal=True)``
+            if the policy was trained behind one; the file then reads the observation before it.
+        scale: its standard deviation.
+        observation_key: key of the normalised observation.
+        metadata: JSON-compatible entries that are added to ``policy``.
 
     Raises:
-        BMRLError: for one of ``loc`` and ``scale`` without the other, a scale that is not finite
-            and positive, an ``observation_key`` that the policy does not read, an example without
-            what it reads, or a generator whose actions are no function of a latent.
+        BMRLError: if only one of ``loc`` and ``scale`` is given, the scale is not finite and
+            positive, the policy does not read ``observation_key``, the example lacks a key, or the
+            generator's actions are not a function of a latent.
         MissingExtraError: without the packages that write ONNX.
 
     Example:
@@ -96,18 +95,18 @@ def export_policy(
             dynamic_shapes=dynamic,
             verbose=False,
         )
-    assert onnx is not None  # for mypy; it is None with the exporter that came before
+    assert onnx is not None  # for mypy; only torch's older exporter returns None
     graph = onnx.model.graph
     for part in (graph, *graph, *graph.initializers.values()):
-        part.metadata_props.clear()  # where on this machine each was traced
-    said = {"kind": type(policy).__name__} | acting.draws | dict(metadata or {})
-    onnx.model.metadata_props["policy"] = json.dumps(said)
+        part.metadata_props.clear()  # paths of source files on this machine
+    description = {"kind": type(policy).__name__} | acting.draws | dict(metadata or {})
+    onnx.model.metadata_props["policy"] = json.dumps(description)
     write_atomic(path, onnx.model_proto.SerializeToString(deterministic=True))
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without what the exporters say of operators that no policy has; errors are raised."""
+    """Suppresses the exporters' warnings, which are about operators that no policy has."""
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
@@ -119,7 +118,7 @@ def _quiet() -> Iterator[None]:
 
 
 class _Acting(nn.Module):
-    """A policy as a function of tensors, the latents of its candidates among them."""
+    """A policy as a function of tensors, including the latents of its candidates."""
 
     loc: Tensor | None
     scale: Tensor | None
@@ -138,7 +137,7 @@ class _Acting(nn.Module):
             raise BMRLError(f"scale is {scale.tolist()}; valid: finite numbers above 0")
         if loc is not None and observation_key not in policy.in_keys:
             raise BMRLError(
-                f"observation_key is {observation_key!r}; valid: what the policy reads, "
+                f"observation_key is {observation_key!r}; valid: keys of the policy, "
                 f"{policy.in_keys}"
             )
         self.policy = deepcopy(policy).cpu().eval().requires_grad_(False)
@@ -163,7 +162,7 @@ class _Acting(nn.Module):
             self.keys.append(policy.keys.action_latent)
 
     def example(self, example: TensorDictBase) -> tuple[Tensor, ...]:
-        """Two rows of everything that :meth:`forward` takes."""
+        """Returns two rows of each input of :meth:`forward`."""
         missing = [key for key in self.policy.in_keys if example.get(key, None) is None]
         if missing:
             raise BMRLError(f"example has no {missing[0]!r}; valid: {self.policy.in_keys}")
@@ -176,7 +175,7 @@ class _Acting(nn.Module):
 
     @torch.no_grad()
     def forward(self, *inputs: Tensor) -> Tensor:
-        """The action of each row."""
+        """Returns the action of each row."""
         values = dict(zip(self.keys, inputs, strict=True))
         if self.loc is not None:
             values[self.observation_key] = (values[self.observation_key] - self.loc) / self.scale

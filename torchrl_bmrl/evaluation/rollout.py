@@ -1,4 +1,4 @@
-"""Whole episodes of a policy in a TorchRL environment."""
+"""Plays whole episodes of a policy in a TorchRL environment."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class EpisodeOutcome:
     """Return and success of one episode.
 
     Attributes:
-        episode_return: sum of rewards up to the end of the episode.
+        episode_return: sum of the rewards.
         success: whether the task succeeded at some step (robomimic's convention); ``None`` if the
-            task has no definition of success.
+            task does not define success.
         stages: number of a composition's tasks that succeeded.
 
     Example:
@@ -42,16 +42,16 @@ def rollout_episodes(
     max_steps: int,
     report: Callable[[int], object] | None = None,
 ) -> TensorDictBase:
-    """One episode, or one in each environment of a batch; the policy acts in all with one call.
+    """Plays one episode, or one in each environment of a batch with one policy call per step.
 
-    ``seed`` decides the starts and what the policy draws. PyTorch's global random state is left as
-    it was.
+    ``seed`` decides the starts and the policy's random numbers. PyTorch's global random state does
+    not change.
 
     Args:
         env: environment with ``observation``, batch ``[]`` or ``[N]``.
         policy: writes ``action``.
-        seed: of the episode; of each one, N of them, in a batch. The policy draws for all of them
-            from one stream, so that its draws depend on the others.
+        seed: seed of the episode, or N seeds. All episodes share one stream of the policy's random
+            numbers, which therefore depend on the batch.
         max_steps: steps after which the episodes are cut off.
         report: called after every step with the number of episodes that advanced.
 
@@ -85,7 +85,7 @@ def rollout_episodes(
         options: dict[str, bool] = {}
         if isinstance(getattr(env, "base_env", env), BatchedEnvBase):
             start = env.reset(list_of_kwargs=[{"seed": each} for each in seeds])
-            # Episodes end one by one; the last observation of an ended one is repeated.
+            # Episodes end at different steps; a finished one repeats its last observation.
             options = {"break_when_any_done": False, "break_when_all_done": True}
         else:
             start = env.reset(seed=seeds if env.batch_size else seeds[0])
@@ -93,7 +93,7 @@ def rollout_episodes(
             max_steps, policy, tensordict=start, auto_reset=False, callback=callback, **options
         )
     if report is not None:
-        report(data.numel() - reported)  # TorchRL calls back between steps: not after the last
+        report(data.numel() - reported)  # TorchRL does not call back after the last step
     return data
 
 
@@ -105,14 +105,13 @@ def evaluate_policy(
     max_steps: int,
     report: Callable[[int], object] | None = None,
 ) -> list[EpisodeOutcome]:
-    """Outcome of one episode per seed, in their order.
-
-    An environment of batch size ``[N]`` plays N of them at a time.
+    """Plays one episode per seed and returns the outcomes in the seeds' order.
 
     Args:
-        env: environment with ``observation`` and perhaps ``success``, batch ``[]`` or ``[N]``.
+        env: environment with ``observation`` and optionally ``success``, batch ``[]`` or ``[N]``,
+            which plays N episodes at a time.
         policy: writes ``action``.
-        seeds: of the episodes; a multiple of N.
+        seeds: seeds of the episodes; their number is a multiple of N.
         max_steps: steps after which an episode is cut off.
         report: called after every step with the number of episodes that advanced.
 
@@ -133,7 +132,7 @@ def evaluate_policy(
         data = rollout_episodes(env, policy, seed=part, max_steps=max_steps, report=report)
         after = data.get("next").reshape(len(part), -1)
         done = after.get("done").squeeze(-1).long()
-        playing = done.cumsum(-1) - done == 0  # up to the step that ends the episode
+        playing = done.cumsum(-1) - done == 0  # up to the last step of the episode
         returns = (after.get("reward").double().squeeze(-1) * playing).sum(-1).tolist()
         successes: list[bool | None] = [None] * len(part)
         if (success := after.get("success", None)) is not None:

@@ -1,4 +1,4 @@
-"""Collects the episodes of scripted experts, each in a file of its own until a task is complete."""
+"""Records episodes of scripted experts, one file for each episode until a task is complete."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ ENV_ARGS = "env_args"
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeJob:
-    """One episode to collect.
+    """One episode to record.
 
     Attributes:
-        task: its task.
-        seed: decides start and noise.
+        task: the task.
+        seed: seed of start and noise.
         noise: standard deviation of the Gaussian noise on each action dimension.
-        path: where the episode is stored.
-        gains: of the expert; ``None`` for its defaults.
+        path: file of the episode.
+        gains: gains of the expert; ``None`` for the defaults.
         after: tasks whose experts act before the episode begins.
 
     Example:
@@ -70,22 +70,22 @@ def collect_demonstrations(
     gains: Any = None,
     after: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, Path]:
-    """Collects demonstrations, one file in robomimic's layout per task.
+    """Records demonstrations, one file in robomimic's layout per task.
 
-    Every finished episode is stored under ``directory/.episodes`` at once. The same call after a
-    kill collects only the missing ones. A task's file appears when its last episode is there.
+    Finished episodes are saved under ``directory/.episodes``, so that after an interruption the
+    same call records only the missing ones. A task's file is written after its last episode.
 
     Args:
-        directory: where ``<task>.hdf5`` is written.
-        tasks: tasks with ``record``; they are collected in this order.
-        episodes: number of episodes to train on, by the task's name.
-        valid_episodes: further episodes of each task, held out under ``mask/valid``.
+        directory: folder of the files ``<task>.hdf5``.
+        tasks: tasks with ``record``, recorded in this order.
+        episodes: number of training episodes by task name.
+        valid_episodes: number of held-out episodes of each task, under ``mask/valid``.
         noise: standard deviation of the Gaussian action noise.
-        seed: episode i of a task is the same in every collection with this seed.
+        seed: the seed; it decides every episode.
         workers: number of processes.
-        gains: of the experts; ``None`` for their defaults.
-        after: by task, names of tasks whose experts act before an episode of it begins, joined by
-            ``-``, or ``""``; the episodes of a task take the entries in turn.
+        gains: gains of the experts; ``None`` for the defaults.
+        after: by task, a list of starts: names of tasks whose experts act first, joined by ``-``,
+            or ``""``; the task's episodes use the entries in turn.
 
     Returns:
         the file of each task.
@@ -93,8 +93,8 @@ def collect_demonstrations(
     Raises:
         ConfigError: for a task without ``record``.
         UnknownNameError: for a name in ``after`` that is not a task.
-        DataError: if a finished file has another number of episodes than asked for.
-        StoppedError: if the run was asked to stop; finished episodes are kept.
+        DataError: if an existing file has another number of episodes.
+        StoppedError: if the run is stopped; finished episodes are saved.
 
     Example:
         >>> import tempfile
@@ -113,7 +113,7 @@ def collect_demonstrations(
     by_name = {task.name: task for task in tasks}
     for task in tasks:
         if task.record is None:
-            raise ConfigError(f"task {task.name} has no expert to record; valid: a task with one")
+            raise ConfigError(f"task {task.name} has no expert; valid: a task with record")
     befores = {
         name: [_parse_after(entry, by_name) for entry in (after or {}).get(name, ())] or [()]
         for name in by_name
@@ -138,7 +138,7 @@ def collect_demonstrations(
         for i, path in enumerate(paths)
         if not path.exists()
     ]
-    # Equal scenes in a row: a worker keeps the last one that it built.
+    # Jobs with equal scenes follow each other, since a worker reuses its last scene.
     order = list(by_name)
     jobs.sort(key=lambda job: (order.index(job.task.name), [task.name for task in job.after]))
     run_jobs(
@@ -161,15 +161,15 @@ def collect_demonstrations(
             env_args=first.attributes.get(ENV_ARGS, {}),
             attributes={"task": name, "action_noise": noise, "seed": seed},
         )
-        # The whole folder: a killed process may have left temporary files there.
+        # The whole folder: a killed process may have left temporary files in it.
         shutil.rmtree(directory / ".episodes" / name)
     for name, path in files.items():
         if count_episodes(path) != counts[name]:
             raise DataError(
                 path,
                 "data",
-                f"holds {count_episodes(path)} episodes where {counts[name]} are asked for; "
-                "give another run_dir or remove the file",
+                f"contains {count_episodes(path)} episodes; valid: {counts[name]}; choose another "
+                "run_dir or remove the file",
             )
     return files
 

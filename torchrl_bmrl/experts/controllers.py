@@ -1,7 +1,7 @@
 """Scripted experts: proportional controllers that read the simulator's state.
 
-An expert goes through a few named phases. Apart from the phase, its actions depend only on what the
-policy's observation contains, so that a policy can learn them. Experts see poses and not joints:
+An expert goes through a few named phases. Apart from the phase, its actions depend only on the
+policy's observation, so that a policy can learn them. Experts use poses and not joints, so that
 they control every arm.
 """
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from torchrl_bmrl.envs.scene import TabletopScene
 
 POSITION_SCALE = 0.05
-"""Metres that an action of 1 asks for."""
+"""Position delta of an action of 1 [m]."""
 ROTATION_SCALE = 0.5
-"""Radians that an action of 1 asks for."""
+"""Rotation delta of an action of 1 [rad]."""
 OPEN, CLOSE = -1.0, 1.0
 RELEASE_MARGIN = 0.003
-"""Fingers within this of their open gap have let go of the cube [m]."""
+"""Fingers closer than this to their open gap have released the cube [m]."""
 
 
 @dataclass(kw_only=True)
@@ -34,17 +34,17 @@ class ExpertGains:
 
     Attributes:
         position: commanded position delta as a multiple of the position error.
-        grasp_position: the same while lifting. A stiff expert hardly ever leaves its line, and a
-            policy that imitates it does not learn the way back.
-        rotation: commanded rotation delta as a share of the rotation error.
+        grasp_position: the same for lifting. A stiff expert rarely leaves its path, so that a
+            policy that imitates it does not learn to return.
+        rotation: commanded rotation delta as a multiple of the rotation error.
         speed_limit: largest position action in free motion, in (0, 1].
-        contact_speed_limit: largest position action while descending on the cube and while
-            pushing it, in (0, 1]. At full speed the arm drifts sideways as it descends.
+        contact_speed_limit: largest position action while descending to the cube and while
+            pushing it, in (0, 1]. At full speed the arm drifts sideways.
         grasp_steps: smallest number of steps for closing; most grippers need 10 from fully open.
-        lift_height: height above its start to which the cube is lifted [m].
-        push_line: distance from the table's centre along the direction to which the cube is
-            pushed [m]. The policy does not observe the cube's start, so a distance from there
-            could not be learned.
+        lift_height: height above the start to which the cube is lifted [m].
+        push_line: distance of the final position from the table's centre, along the pushing
+            direction [m]. A distance from the cube's start could not be learned, since the policy
+            does not observe that start.
 
     Example:
         >>> gains = ExpertGains(speed_limit=0.5)
@@ -72,8 +72,8 @@ class Expert:
         gains: gains and limits; ``None`` for the defaults.
 
     Attributes:
-        skill: the scene's skill at hand.
-        phase: index of the present phase in :attr:`phases`.
+        skill: the scene's current skill.
+        phase: index of the current phase in :attr:`phases`.
 
     Example:
         >>> from torchrl_bmrl.envs.tabletop import TabletopEnv
@@ -97,7 +97,7 @@ class Expert:
         self.reset()
 
     def reset(self) -> None:
-        """Starts over; call after every reset of the environment."""
+        """Restarts the expert; call it after every reset of the environment."""
         self.phase = 0
         self._rotation = self.env.eef_rotation
 
@@ -109,7 +109,7 @@ class Expert:
         return self.gains.position
 
     def __call__(self) -> np.ndarray:
-        """Noise-free action (7,) in [-1, 1] for the environment's present state."""
+        """Returns the action (7,) in [-1, 1] for the current state, without noise."""
         target, gripper, limit = self._target()
         delta = self._gain() * (target - self.env.eef_position) / POSITION_SCALE
         current = self.env.eef_rotation
@@ -119,12 +119,12 @@ class Expert:
 
 
 class ReachExpert(Expert):
-    """Straight to the goal, the gripper open or closed as it was at the start."""
+    """Moves straight to the goal; the gripper stays open or closed."""
 
     phases = ("reach",)
 
     def reset(self) -> None:
-        """Starts over; the gripper continues to open or to close."""
+        """Restarts the expert; the gripper keeps its current command."""
         super().reset()
         self._gripper = CLOSE if self.env.gripper.closing else OPEN
 
@@ -133,12 +133,12 @@ class ReachExpert(Expert):
 
 
 class LiftExpert(Expert):
-    """Descend onto the cube, grasp it, lift it."""
+    """Descends to the cube, grasps it and lifts it."""
 
     phases = ("descend", "grasp", "lift")
 
     def reset(self) -> None:
-        """Starts over, gripper open."""
+        """Restarts the expert with the gripper open."""
         super().reset()
         self._closing = 0
 
@@ -151,7 +151,7 @@ class LiftExpert(Expert):
             offset = self.env.eef_position - cube
             if np.linalg.norm(offset[:2]) < 0.015 and abs(offset[2]) < 0.01:
                 self.phase = 1
-            # Only above the cube is it safe to go down.
+            # It is safe to descend only above the cube.
             elif np.linalg.norm(offset[:2]) > 0.03:
                 cube = cube + np.array([0.0, 0.0, max(offset[2], 0.05)])
             return cube, OPEN, limit
@@ -170,24 +170,24 @@ class LiftExpert(Expert):
 
 
 class PushExpert(Expert):
-    """Go beside the cube with the gripper closed, come down, push it over the line.
+    """Descends beside the cube with the gripper closed and pushes the cube over the line.
 
-    A cube that is in the hand is first brought down to the table and released.
+    A grasped cube is first put on the table and released.
     """
 
     phases = ("approach", "contact", "push", "release")
     stand_off: ClassVar[float] = 0.055
-    """Distance behind the cube's centre at which the gripper comes down [m]."""
+    """Distance behind the cube's centre at which the gripper descends [m]."""
 
     skill: Push
 
     def reset(self) -> None:
-        """Starts over, first releasing the cube if it is in the hand."""
+        """Restarts the expert; it first releases a grasped cube."""
         super().reset()
         self.phase = 3 if self.env.grasped else 0
 
     def _release(self) -> tuple[np.ndarray, float, float] | None:
-        """Down to the table, open, up again; ``None`` once the hand is clear of the cube."""
+        """Target for releasing the cube; ``None`` once the gripper is clear of it."""
         cube, eef = self.env.goal, self.env.eef_position
         limit = self.gains.contact_speed_limit
         height, up = cube[2] - self.env.goal_start[2], np.array([0.0, 0.0, 1.0])
@@ -195,7 +195,7 @@ class PushExpert(Expert):
             return eef - max(0.02, height) * up, CLOSE, limit
         around = self.env.gripper.gap < self.env.gripper.open_gap - RELEASE_MARGIN
         if around and eef[2] - cube[2] < 0.03:
-            return eef.copy(), OPEN, limit  # opens around the cube before it leaves
+            return eef.copy(), OPEN, limit  # opens before it rises
         if eef[2] - cube[2] < 0.06:
             return eef + 0.05 * up, OPEN, limit
         return None
@@ -216,19 +216,19 @@ class PushExpert(Expert):
             self.phase = 1
         if self.phase == 1 and horizontal > 0.04:
             self.phase = 0
-        # Off centre the push turns the cube, and it slips away sideways.
+        # An off-centre push turns the cube, and it slips away sideways.
         if self.phase == 1 and height < 0.012 and sideways < 0.008:
             self.phase = 2
         if self.phase == 0:
-            # Rise first, so as not to knock the cube on the way to its other side.
+            # Rises first, so as not to hit the cube on the way to its other side.
             lift = np.array([0.0, 0.0, 0.05])
             clear = behind + np.array([0.0, 0.0, 0.08])
             target = clear if height > 0.045 or horizontal < 0.03 else eef + lift
             return target, CLOSE, self.gains.speed_limit
         if self.phase == 1:
             return behind, CLOSE, self.gains.speed_limit
-        # The target is ahead of the cube until it is over the line; from there on, or off centre,
-        # it is clear of the cube, where friction does not drag it along sideways.
+        # The target is ahead of the cube until the cube is over the line. After that, or off
+        # centre, it is clear of the cube, so that friction does not drag the cube sideways.
         pushing = cube @ along < self.gains.push_line and sideways < 0.012
         ahead = 0.05 if pushing else -self.stand_off
         return cube + ahead * along, CLOSE, self.gains.contact_speed_limit
@@ -243,7 +243,7 @@ EXPERTS: dict[type[Skill], type[Expert]] = {
 
 
 class ComposedExpert:
-    """The experts of a composition's skills, each from where the one before it succeeded.
+    """The experts of a composition's skills in turn; each starts when the one before succeeded.
 
     Args:
         env: the scene to control, after a reset.
@@ -263,22 +263,22 @@ class ComposedExpert:
         self.reset()
 
     def reset(self) -> None:
-        """Starts over with the skill at hand; call after every reset of the environment."""
+        """Restarts with the current skill; call it after every reset of the environment."""
         self._stage = min(self.env.stage, len(self.experts) - 1)
         self.expert = self.experts[self._stage](self.env, self.gains)
 
     @property
     def phases(self) -> tuple[str, ...]:
-        """The present expert's phases."""
+        """The current expert's phases."""
         return self.expert.phases
 
     @property
     def phase(self) -> int:
-        """The present expert's phase."""
+        """The current expert's phase."""
         return self.expert.phase
 
     def __call__(self) -> np.ndarray:
-        """Noise-free action (7,) in [-1, 1] for the environment's present state."""
+        """Returns the action (7,) in [-1, 1] for the current state, without noise."""
         if self.env.stage not in (self._stage, len(self.experts)):
             self.reset()
         return self.expert()
@@ -290,18 +290,15 @@ def make_expert(
     *,
     experts: Sequence[type[Expert]] | None = None,
 ) -> Expert | ComposedExpert:
-    """Scripted expert for a scene's skill, or for a composition's skills in turn.
+    """Returns the scripted expert of a scene's skill, or of a composition's skills in turn.
 
     Args:
         env: the scene, after a reset.
         gains: gains and limits; ``None`` for the defaults.
         experts: the class of each skill's expert; ``None`` for those of :data:`EXPERTS`.
 
-    Returns:
-        a callable that returns an action (7,) in [-1, 1] for the scene's present state.
-
     Raises:
-        BMRLError: if a skill has no expert in :data:`EXPERTS` and none is given.
+        BMRLError: if ``experts`` is ``None`` and a skill has no expert in :data:`EXPERTS`.
 
     Example:
         >>> from torchrl_bmrl.envs.tabletop import TabletopEnv

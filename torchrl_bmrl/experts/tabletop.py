@@ -1,8 +1,8 @@
-"""Tasks of the tabletop scene: a skill, its expert, an arm.
+"""Tasks of the tabletop scene, made of a skill, its expert and an arm.
 
 :func:`make_task` turns a :class:`~torchrl_bmrl.envs.skills.Skill` and the class of its
 :class:`~torchrl_bmrl.experts.controllers.Expert` into a :class:`~torchrl_bmrl.tasks.Task`.
-Importing this module registers the six tasks of the paper. The first episode loads the simulator.
+Importing this module registers the paper's six tasks; it does not import the simulator.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from torchrl_bmrl.envs.tabletop import TabletopEnv
 
 STAGE_HORIZON = 100
-"""Steps that an episode of a composition has for each of its tasks."""
+"""Steps of a composition's episode for each of its tasks."""
 OBSERVATION_PARTS = (
     "sin_joint_pos",
     "cos_joint_pos",
@@ -40,21 +40,21 @@ OBSERVATION_PARTS = (
 )
 """Order of the parts in ``observation``."""
 MAX_ATTEMPTS = 100
-"""Starts that are tried until the tasks before an episode succeed."""
+"""Number of starts that are tried until the tasks before an episode succeed."""
 
 
 def make_task(
     skill: Skill, expert: type[Expert], *, robot: str = "Sawyer", horizon: int = 200
 ) -> Task:
-    """The task of one skill, to be registered with :func:`~torchrl_bmrl.tasks.register_task`.
+    """Returns the task of one skill, for :func:`~torchrl_bmrl.tasks.register_task`.
 
-    Its options are ``skills``, ``robot``, ``gripper``, ``stepper`` and ``horizon``, those of
+    Its options are ``skills``, ``robot``, ``gripper``, ``stepper`` and ``horizon`` of
     :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`. Compositions have :data:`STAGE_HORIZON` steps
     for each skill.
 
     Args:
         skill: start, goal, reward and success.
-        expert: class of the scripted expert that demonstrates the skill.
+        expert: class of the skill's scripted expert.
         robot: the arm.
         horizon: steps of an episode.
 
@@ -86,13 +86,13 @@ def _make_task(
 
 
 def compose_tasks(tasks: Sequence[Task]) -> Task:
-    """The task of several tasks of :func:`make_task` in a row, with the options of the first.
+    """Returns the composition of several tasks of :func:`make_task`, with the first's options.
 
     Args:
-        tasks: in their order; all with the same arm.
+        tasks: the tasks in their order, all with the same arm.
 
     Raises:
-        ConfigError: if they have different arms.
+        ConfigError: if the arms differ.
 
     Example:
         >>> from torchrl_bmrl.tasks import get_task
@@ -102,14 +102,14 @@ def compose_tasks(tasks: Sequence[Task]) -> Task:
     robots = {task.options["robot"] for task in tasks}
     if len(robots) > 1:
         names = ", ".join(task.name for task in tasks)
-        raise ConfigError(f"{names} have the arms {', '.join(sorted(robots))}; valid: one arm")
+        raise ConfigError(f"{names} have the arms {', '.join(sorted(robots))}; valid: the same arm")
     skills, experts = _chain(tasks)
     options = {**tasks[0].options, "horizon": STAGE_HORIZON * len(skills)}
     return _make_task(skills, experts, options)
 
 
 def _chain(tasks: Sequence[Task]) -> tuple[list[Skill], list[type[Expert]]]:
-    """Skills and experts of tasks in a row."""
+    """Returns the skills and the experts of several tasks."""
     skills = [skill for task in tasks for skill in task.options["skills"]]
     records = [cast("partial[Episode]", task.record) for task in tasks]
     return skills, [expert for record in records for expert in record.keywords["experts"]]
@@ -121,16 +121,15 @@ def make_tabletop_env(
     num_envs: int | None = None,
     **options: Any,
 ) -> EnvBase:
-    """TorchRL environment with the named parts of the observation.
+    """Returns a TorchRL environment with the named parts of the observation.
 
-    ``success``, ``stage`` and each reward term, ``reward_<term>``, are read from ``info`` into the
-    tensordict.
+    The tensordict contains ``success``, ``stage`` and each reward term ``reward_<term>``.
 
     Args:
         skills: as for :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`.
-        num_envs: batch size ``[num_envs]``: episodes in one simulator, for a policy that acts in
-            all of them with one call; ``None`` for no batch dimension.
-        **options: of :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`.
+        num_envs: number of episodes in one simulator, batch ``[num_envs]``; ``None`` for no batch
+            dimension.
+        **options: options of :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`.
 
     Example:
         >>> from torchrl_bmrl.envs.skills import Push
@@ -163,7 +162,7 @@ def make_tabletop_env(
 
 
 def observation_transforms() -> list[Transform]:
-    """Transforms from the named parts to ``observation``, for environments and stored data.
+    """Returns the transforms from the named parts to ``observation``.
 
     Joint positions become their sines and cosines. For an arm with n joints and a gripper with k,
     ``observation`` has 3n + k + 10 numbers: 33 for Sawyer.
@@ -186,7 +185,7 @@ _last: tuple[Any, TabletopEnv] | None = None
 
 
 def _env(skills: tuple[Skill, ...], options: dict[str, Any]) -> TabletopEnv:
-    # Building the complete model takes a second: the last environment is kept.
+    # Building the model takes a second, so the last environment is reused.
     global _last
     key = skills, options
     if _last is None or _last[0] != key:
@@ -210,26 +209,26 @@ def record_episode(
     after: Sequence[Task] = (),
     **options: Any,
 ) -> Episode:
-    """One episode of the scripted expert, reproduced by ``seed``.
+    """Records one episode of the scripted expert; ``seed`` reproduces it.
 
     Args:
-        seed: decides start and noise.
-        skills: one, or several in a row.
+        seed: seed of start and noise.
+        skills: one skill, or those of a composition.
         experts: the class of each skill's expert.
         horizon: steps of the episode.
         noise: standard deviation of the Gaussian noise on each action dimension.
-        gains: of the experts; ``None`` for the defaults.
-        after: tasks whose experts act first. The episode begins where the last of them succeeded,
-            with arm, gripper and cube as they are then. Empty: where the skill itself begins.
+        gains: gains of the experts; ``None`` for the defaults.
+        after: tasks whose experts act first; the episode starts in the state in which the last of
+            them succeeded. If empty, it starts in the skill's own starting state.
         **options: ``robot``, ``gripper`` and ``stepper`` of
             :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`.
 
     Returns:
-        the episode with the extras ``successes``, ``states`` and, for one skill, ``phases``, for a
-        composition ``stages``. The attribute ``env_args`` is robomimic's.
+        the episode with the extras ``successes``, ``states`` and, for one skill, ``phases``, or for
+        a composition ``stages``. The attribute ``env_args`` is robomimic's.
 
     Raises:
-        BMRLError: if the experts of ``after`` fail in 100 starts.
+        BMRLError: if the experts of ``after`` fail from 100 starts.
 
     Example:
         >>> from torchrl_bmrl.tasks import get_task
@@ -246,7 +245,7 @@ def record_episode(
     rng = np.random.default_rng(derive_seed(seed, "action noise"))
 
     def act() -> np.ndarray:
-        # Rounded to float32 first: the executed action is the stored one to the bit.
+        # float32, so that the executed action is the stored one to the bit.
         return np.clip(expert() + noise * rng.standard_normal(7), -1.0, 1.0).astype(np.float32)
 
     for attempt in range(MAX_ATTEMPTS):
@@ -258,8 +257,8 @@ def record_episode(
             break
     else:
         raise BMRLError(
-            f"the experts of {'-'.join(skill.name for skill in before)} failed in {MAX_ATTEMPTS} "
-            "starts; valid in after: tasks that they solve"
+            f"the experts of {'-'.join(skill.name for skill in before)} failed from {MAX_ATTEMPTS} "
+            "starts; valid in after: tasks that their experts solve"
         )
     observations = {name: [part] for name, part in observation.items()}
     model_file = scene.scene_xml()
@@ -276,7 +275,7 @@ def record_episode(
         rewards.append(reward)
         successes.append(scene.skill_success() if before else info["success"])
     parts = {name: np.stack(rows) for name, rows in observations.items()}
-    # The phases of a composition's experts have no names in common; its stages are stored instead.
+    # A composition's experts have different phases; its stages are stored instead.
     alone = len(skills) == 1
     return Episode(
         observations={name: part[:-1] for name, part in parts.items()},
@@ -290,7 +289,7 @@ def record_episode(
             "states": np.stack(states),
             **({} if alone else {"stages": np.array(stages, dtype=np.int8)}),
         },
-        # robomimic plays states back in the model of the demonstration.
+        # robomimic needs the model to play back the states.
         attributes={
             "seed": seed,
             **({"phase_names": list(expert.phases)} if alone else {}),
