@@ -18,6 +18,8 @@ from torchrl_bmrl import pipeline
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 HORIZON = 10
+TASKS = {name: {"task": name, "horizon": HORIZON} for name in ("reach", "lift")}
+"""The small runs' tasks, for settings that are made in Python."""
 
 
 def tasks(*names: str) -> str:
