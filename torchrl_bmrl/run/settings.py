@@ -81,10 +81,13 @@ def _check(name: str, value: Any, valid: Mapping[str, Any]) -> None:
     if valid["unique"] and (not value or any(x in value[:i] for i, x in enumerate(value))):
         raise ConfigError(f"{name} is {value}; valid: at least one value, each once")
     for key, item in _items(name, value):
-        if valid["choices"] and item not in valid["choices"]:
-            raise UnknownNameError(name, item, valid["choices"])
-        if isinstance(item, int | float) and not _is_within(item, valid):
-            raise ConfigError(f"{key} is {item}; valid: {_describe(valid)}")
+        if valid["choices"]:
+            if item not in valid["choices"]:
+                raise UnknownNameError(name, item, valid["choices"])
+            continue
+        # A reference to another value may bring a text.
+        if item is not None and not (isinstance(item, int | float) and _is_within(item, valid)):
+            raise ConfigError(f"{key} is {item!r}; valid: {_describe(valid)}")
 
 
 def _items(name: str, value: Any) -> Iterator[tuple[str, Any]]:
