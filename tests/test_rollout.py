@@ -81,4 +81,4 @@ def test_seeds_that_do_not_fill_the_environments_are_refused(seeds: list[int]) -
         closing(make_env("reach", num_envs=2)) as env,
         pytest.raises(BMRLError, match=r"1 seeds for 2 environments|3 seeds for 2"),
     ):
-        rollout_episodes(env, Towards(), seed=seeds)
+        rollout_episodes(env, Towards(), seed=seeds, max_steps=5)
