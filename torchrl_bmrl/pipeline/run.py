@@ -131,7 +131,10 @@ class Run:
             )
 
     def task(self, name: str) -> Task:
-        """Returns a task of the run by name.
+        """Returns a task of the run.
+
+        Args:
+            name: name of the task.
 
         Raises:
             UnknownNameError: for a name that is not a task of the run.
@@ -166,11 +169,19 @@ class Run:
         return self.folder / "distill" / "checkpoint.safetensors"
 
     def demonstrations(self, name: str) -> Path:
-        """Returns the file with a task's demonstrations."""
+        """Returns the file with a task's demonstrations.
+
+        Args:
+            name: name of the task.
+        """
         return demonstration_path(self.data_dir, name)
 
     def agent_path(self, name: str) -> Path:
-        """Returns the checkpoint of a stage-1 agent; a task's first agent has the task's name."""
+        """Returns the checkpoint of a stage-1 agent.
+
+        Args:
+            name: name of the agent; a task's first agent has the task's name.
+        """
         return self.folder / "bcq" / name / "checkpoint.safetensors"
 
     @cached_property
@@ -191,7 +202,11 @@ class Run:
         )
 
     def teacher(self, name: str) -> BCQLoss:
-        """Returns the trained agent of a task, frozen."""
+        """Returns the trained agent of a task, frozen.
+
+        Args:
+            name: name of the task.
+        """
         return load_bcq_loss(self.agent_path(name))[0]
 
     def student(self) -> tuple[Student, dict[str, Any]]:
@@ -242,8 +257,15 @@ class Run:
     ) -> list[Result]:
         """Calls ``function((run, job), report)`` for every job in the run's workers.
 
-        The arguments are those of :func:`~torchrl_bmrl.run.workers.run_jobs`; ``workers`` is by
-        default that of the settings.
+        See :func:`~torchrl_bmrl.run.workers.run_jobs`.
+
+        Args:
+            function: runs one job; it must be importable by name.
+            jobs: the jobs.
+            total: units of all jobs, for the progress.
+            description: name of the jobs.
+            unit: name of a unit, in the singular.
+            workers: number of processes; by default that of the settings.
 
         Raises:
             BMRLError: if the run is not open, or a job fails.
@@ -261,7 +283,10 @@ class Run:
     def make_env(self, task: Task, *transforms: Transform, num_envs: int) -> TransformedEnv:
         """Returns a task's environment with this run's normalisation.
 
-        The other arguments are those of :func:`~torchrl_bmrl.envs.transforms.make_env`.
+        Args:
+            task: a task of this run, or a composition.
+            *transforms: appended transforms.
+            num_envs: number of parallel episodes.
         """
         return make_env(task, self.statistics, *transforms, num_envs=num_envs)
 
