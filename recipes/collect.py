@@ -1,9 +1,9 @@
-"""Demonstrations of the scripted experts: one robomimic-layout HDF5 file per task.
+"""Records demonstrations of the scripted experts, one HDF5 file in robomimic's layout per task.
 
     python recipes/collect.py                    # 60 + 6 episodes of each task, 80 + 6 of lift
     python recipes/collect.py preset=paper       # the paper's sizes
 
-Finished episodes survive a kill; the same command resumes.
+Finished episodes are saved at once; the same command continues after an interruption.
 """
 
 from __future__ import annotations

@@ -34,9 +34,9 @@ from torchrl_bmrl.run.settings import check_settings
 log = logging.getLogger("torchrl_bmrl.recipes")
 
 NAMES = ("preset", "ablation")
-"""Settings that stand for many others."""
+"""Settings that select other settings."""
 OF_THE_COMMAND = ("run_dir", "base", "only", "workers", "verbose")
-"""Settings that a later command in the same folder does not take over."""
+"""Settings that a command does not read from the run folder."""
 OUT_OF_MEMORY = (
     "lower bcq.batch_size or bcq.seeds in stage 1 (bcq.stacked=false trains one agent at a time), "
     "distill.batch_size in stage 2"
@@ -45,10 +45,10 @@ _sections: dict[str, type] = {}
 
 
 def add_section(name: str, settings: type) -> None:
-    """Adds the settings of a study to those of a run, for the command line.
+    """Adds a section with the settings of a study to the command line.
 
     Args:
-        name: of the section.
+        name: name of the section.
         settings: a dataclass.
     """
     _sections[name] = settings
@@ -65,23 +65,23 @@ def run_recipe(
     splits: bool = False,
     trains: bool = True,
 ) -> None:
-    """Calls ``function(run)`` or ``function(run, settings)`` and prints the text it returns.
+    """Calls ``function(run)`` or ``function(run, settings)`` and prints the returned text.
 
-    Errors and signals end the process as a command should.
+    Errors and signals become exit codes (:func:`~torchrl_bmrl.run.command_line.exit_codes`).
 
     Args:
-        config: as Hydra composed it.
-        function: of the package.
-        section: name of a study's settings, which are the second argument.
-        splits: whether the function does the tasks of ``only`` alone.
-        trains: whether the function needs the run's ``device`` on this machine.
+        config: Hydra's configuration.
+        function: a function of the package.
+        section: section of the settings that are the second argument.
+        splits: whether the function supports ``only``.
+        trains: whether the function needs the run's ``device``.
     """
     with exit_codes(out_of_memory=OUT_OF_MEMORY):
         log_to_stderr(verbose=config.get("verbose") is True)
         try:
             composed, config = config, with_folders_settings(config)
             values = OmegaConf.to_object(config)
-        except OmegaConfBaseException as error:  # for example a reference to nothing
+        except OmegaConfBaseException as error:  # for example a reference to an unknown name
             raise ConfigError(str(error).partition("\n")[0]) from error
         settings = Settings(**{each.name: getattr(values, each.name) for each in fields(Settings)})
         settings.check(device=trains or config is composed)
@@ -99,20 +99,20 @@ def run_recipe(
 
 
 def with_folders_settings(config: DictConfig) -> DictConfig:
-    """Takes the settings that the command line does not give from the folder's run.
+    """Fills in the settings of an existing run folder that the command line does not set.
 
-    The folder must be given, too: a default name does not select an earlier run. Settings that
-    are given are compared with the folder's when it is opened.
+    This requires an explicit ``run_dir``. Settings of the command line are compared with those of
+    the folder when the run is opened.
 
     Args:
-        config: as composed of the command line and the preset.
+        config: configuration of the command line and the preset.
 
     Raises:
-        BMRLError: if the folder has no name, its settings are damaged, or the command gives
-            another preset or ablation with other settings.
+        BMRLError: if ``run_dir`` is empty, the folder's settings are damaged, or another preset or
+            ablation is given whose settings differ.
     """
     if not config.run_dir:
-        raise ConfigError("run_dir is ''; valid: a folder, such as . for the present one")
+        raise ConfigError("run_dir is ''; valid: a folder, such as . for the current one")
     given, run_dir = _given(config), Path(config.run_dir)
     if not given.get("run_dir") or not (run_dir / "config.yaml").exists():
         return config
@@ -127,20 +127,20 @@ def with_folders_settings(config: DictConfig) -> DictConfig:
                 "run; give the same settings to go on, or another run_dir"
             )
     taken = deepcopy(config)
-    taken.run_dir = str(run_dir)  # it may refer to a setting that is taken
+    taken.run_dir = str(run_dir)  # it may refer to a setting that changes
     tasks = theirs.pop("tasks", None)
-    # References in a file are not followed.
+    # References in a file are ignored.
     if tasks is not None and "tasks" not in given and "${" not in str(tasks):
         taken.tasks = tasks
     for key, value in flat(theirs):
         if not _is_any(key, [*given, *OF_THE_COMMAND]) and "${" not in str(value):
-            # Settings that no longer exist are skipped; invalid values are refused later.
+            # Settings that no longer exist are skipped; invalid values raise an error later.
             with suppress(OmegaConfBaseException):
                 group = key.rpartition(".")[0]
                 by_task = bool(group) and OmegaConf.get_type(OmegaConf.select(taken, group)) is dict
                 OmegaConf.update(taken, key, value, force_add=by_task)
     if taken != config:
-        log.info("%s: settings that were not given are those of its config.yaml", run_dir)
+        log.info("%s: other settings are read from its config.yaml", run_dir)
     return taken
 
 
@@ -150,13 +150,13 @@ def _is_any(key: str, names: Iterable[str]) -> bool:
 
 
 def _given(config: DictConfig) -> Mapping[str, Any]:
-    """Settings that the command line gives, by dotted names; none outside of Hydra."""
+    """Returns the settings of the command line, by dotted names; none outside of Hydra."""
     if not HydraConfig.initialized():
         return {}
     lines = list(HydraConfig.get().overrides.task)
     overrides = OverridesParser.create().parse_overrides(lines)
     given = dict(flat({override.key_or_group: override.value() for override in overrides}))
-    # Hydra keeps the overrides of its last command; this configuration may be made in code.
+    # Hydra still has the overrides of its last command if this configuration is made in code.
     own: Any = OmegaConf.to_container(config, resolve=False)
     return given if own["run_dir"] == given.get("run_dir") else {}
 

@@ -1,4 +1,4 @@
-"""Episodes from starts that no demonstration had, and the report.
+"""Evaluates the policies from new starts and writes the report.
 
 python recipes/evaluate.py run_dir=runs/mine            # after recipes/distill.py
 python recipes/evaluate.py run_dir=runs/mine "evaluate.latent_sources=[prototype,online]"

@@ -1,11 +1,11 @@
-"""A run's distilled policy as one small file, with a demonstration of each task and a card.
+"""Exports a run's distilled policy as one small file, with a card and an ONNX file.
 
     python recipes/export.py run_dir=runs/mine             # after recipes/evaluate.py
     python recipes/export.py evaluate.policy=recipes/policies/sawyer.safetensors  # no run needed
 
 Writes policy.safetensors, policy.md and policy.onnx into the run folder. The first file is enough
-to act: recipes/evaluate.py evaluate.policy=policy.safetensors. The ONNX file acts without this
-library (docs/export.md); of an exported policy it is all that is written.
+for recipes/evaluate.py evaluate.policy=policy.safetensors. The ONNX file runs without this library
+(docs/export.md); for an exported policy only this file is written.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Fitted Q evaluation: which checkpoint is best, estimated without a simulator?
+"""Fitted Q evaluation: ranks checkpoints without a simulator.
 
     python recipes/fqe.py run_dir=runs/mine                  # after recipes/collect.py
     python recipes/fqe.py run_dir=runs/mine "fqe.checkpoints=[500,1000,2000]" fqe.updates=1000
 
-Stage 1 trains a series of agents for each task. Fitted Q evaluation estimates the return of each
-from the demonstrations; then each plays the evaluation's episodes. docs/fqe.md explains the table.
+Stage 1 trains a series of agents for each task. Fitted Q evaluation estimates each agent's return
+from the demonstrations; episodes measure it for comparison. docs/fqe.md explains the table.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the policy does between the tasks: interpolation in the embedding as exploration.
+"""Interpolates between the tasks in the embedding, and uses this for exploration.
 
     python recipes/interpolate.py run_dir=runs/mine      # after recipes/two_stage.py
     python recipes/interpolate.py run_dir=runs/mine interpolation.task=push_up

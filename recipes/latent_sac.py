@@ -1,9 +1,9 @@
-"""Learning on top: SAC chooses m, and the frozen distilled policy acts.
+"""SAC whose action is m, which the frozen distilled policy executes.
 
     python recipes/latent_sac.py run_dir=runs/mine      # after recipes/two_stage.py preset=compose
     python recipes/latent_sac.py run_dir=runs/mine latent_sac.composition=lift-reach
 
-Finished agents are skipped; one that was stopped starts over (docs/latent_sac.md).
+Finished agents are skipped; an interrupted one starts again (docs/latent_sac.md).
 """
 
 from __future__ import annotations

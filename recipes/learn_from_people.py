@@ -1,4 +1,4 @@
-"""Scripted and human demonstrations together: do the human ones help?
+"""Trains agents on scripted and human demonstrations together, to see whether the latter help.
 
     python recipes/learn_from_people.py human.path=demo.hdf5
     python recipes/learn_from_people.py human.path=demo.hdf5 "human.shares=[0,0.5]" \

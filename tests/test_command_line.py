@@ -160,13 +160,13 @@ def test_rows_that_are_read_back_are_reported_as_the_steps_that_they_took(
     recipes: Any, tmp_path: Path
 ) -> None:
     pytest.importorskip("matplotlib")
-    from torchrl_bmrl.pipeline.evaluate import keep_rows
+    from torchrl_bmrl.pipeline.evaluate import evaluate_once
 
     run = make_run(tmp_path, "tasks={lift:{task:lift,horizon:7}}", "evaluate.episodes=3")
     (tmp_path / "evaluation").mkdir()
     write_results(tmp_path / "evaluation" / "lift-bcq.csv", [])
     reported: list[int] = []
-    keep_rows(run, "lift", "bcq", lambda _: [], report=reported.append)
+    evaluate_once(run, "lift", "bcq", lambda _: [], report=reported.append)
     assert reported == [7 * 3]
 
 

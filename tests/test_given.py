@@ -77,7 +77,7 @@ def test_a_command_on_a_run_takes_what_it_does_not_give_from_the_folder(
     assert (config.workers, config.verbose, config.run_dir) == (2, False, str(made))
     assert config.device == "cuda"
     assert contents(made, "*") == before
-    said = f"{made}: settings that were not given are those of its config.yaml\n"
+    said = f"{made}: other settings are read from its config.yaml\n"
     assert capsys.readouterr().err.endswith(said)
 
 

@@ -182,7 +182,7 @@ def test_every_job_that_fails_is_named_and_the_others_are_done(
     code, said, files = sweep(tmp_path, *options)
     assert code == 1
     assert files == {"1.10-0", "1.10-2", "1.10-4"}
-    lines = said.partition("2 of 5 jobs failed, the others are done:\n")[2].splitlines()
+    lines = said.partition("2 of 5 jobs failed; the others are done:\n")[2].splitlines()
     assert lines[:2] == ["seed=1 run_dir='1.10'", "    error: no seed for me"]
     assert lines[2:4] == ["seed=3 run_dir='1.10'", "    Traceback (most recent call last):"]
     assert lines[-1] == "KeyError: 'robot'"
@@ -197,9 +197,9 @@ def test_jobs_that_failed_are_named_though_another_ones_process_was_killed(
     options = ["seed=0,1,5", "run_dir=x", *LAUNCHERS[launcher]]
     code, said, files = sweep(tmp_path, *options)
     assert (code, files) == (1, {"x-0"})
-    lines = said.partition("2 of 3 jobs failed, the others are done:\n")[2].splitlines()
+    lines = said.partition("2 of 3 jobs failed; the others are done:\n")[2].splitlines()
     assert lines[:3] == ["seed=1 run_dir=x", "    error: no seed for me", "seed=5 run_dir=x"]
-    assert lines[3].startswith("    did not end: ")
+    assert lines[3].startswith("    not finished: ")
     assert "Traceback" not in said
 
 
@@ -209,7 +209,7 @@ def test_jobs_that_are_not_valid_are_all_named_before_anything_is_done(tmp_path:
     code, said, _ = sweep(tmp_path, *options)
     assert code == 1
     assert list(tmp_path.iterdir()) == []
-    lines = said.partition("2 of 3 jobs are not valid, none was started:\n")[2].splitlines()
+    lines = said.partition("2 of 3 jobs are not valid; none was started:\n")[2].splitlines()
     assert [line for line in lines if not line.startswith(" ")] == [
         "bcq.lr=abc run_dir=x",
         "bcq.lr=def run_dir=x",
@@ -222,7 +222,7 @@ def test_a_batch_goes_on_after_one_whose_jobs_failed(tmp_path: Path) -> None:
     options = ["seed=1,3,2", "run_dir=x", "hydra.sweeper.max_batch_size=1"]
     code, said, files = sweep(tmp_path, *options)
     assert (code, files) == (1, {"x-2"})
-    assert "2 of 3 jobs failed, the others are done:\nseed=1 run_dir=x\n" in said
+    assert "2 of 3 jobs failed; the others are done:\nseed=1 run_dir=x\n" in said
     assert "\nseed=3 run_dir=x\n" in said
 
 
@@ -274,7 +274,7 @@ def check_sweep_of_three_seeds(cwd: Path, alone: list[dict[str, bytes]], *launch
     (taken / "config.yaml").write_text(yaml.safe_dump({"seed": 7}))
     done = recipe("collect", "--multirun", *REACH, "seed=0,1,2", *launcher, cwd=cwd)
     assert done.returncode == 1
-    _, message = done.stderr.split("1 of 3 jobs failed, the others are done:\n")
+    _, message = done.stderr.split("1 of 3 jobs failed; the others are done:\n")
     names, problem = message.splitlines()
     assert set(REACH) | {"seed=1"} <= set(names.split())
     assert problem.startswith("    error: runs/collect-smoke-seed1: ")

@@ -704,7 +704,7 @@ def test_a_run_says_nothing_more_than_its_tables_unless_it_is_verbose(
         f"{folder}: two_stage, smoke",
         "bcq lift: resumed from update 12",
         "distillation: resumed from update 12",
-        f"{folder / 'evaluation' / 'lift-bcq.csv'}: read back",
+        f"{folder / 'evaluation' / 'lift-bcq.csv'}: loaded",
         "stage 2: done",
     ):
         assert line in told.err.splitlines()

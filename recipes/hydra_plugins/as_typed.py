@@ -1,4 +1,4 @@
-"""Texts as they were typed: Hydra makes numbers of what looks like one, 1.1 of ``run_dir=1.10``."""
+"""Keeps text settings as typed; Hydra parses ``run_dir=1.10`` as the number 1.1."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 PARTS = re.compile(r"""'(?:\\.|[^'])*'|"(?:\\.|[^"])*"|[^][,()'"]+""")
-"""Of a list, or of a sweep's values: texts in quotes, and what lies between separators."""
+"""The elements of a list or of a sweep: quoted texts, and texts between separators."""
 
 
 class AsTyped(Callback):
-    """Quotes what Hydra would not take for text, in settings that are text.
+    """Hydra callback that quotes values of text settings that Hydra would parse as numbers.
 
-    One run gets its values anew; a sweep hands the quotes on to its jobs.
+    A single run is updated with the quoted values; a sweep passes the quotes to its jobs.
     """
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Puts right what was composed."""
+        """Corrects the configuration of a single run."""
         parser = OverridesParser.create()
         for line in list(config.hydra.overrides.task):
             if (typed := as_typed(line, config)) != line:
@@ -32,22 +32,22 @@ class AsTyped(Callback):
         self.on_multirun_start(config)
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Puts right what the jobs will be composed of."""
+        """Corrects the overrides of a sweep."""
         with open_dict(config.hydra):
             lines = [as_typed(line, config) for line in config.hydra.overrides.task]
             config.hydra.overrides.task = lines
 
 
 def as_typed(line: str, config: DictConfig) -> str:
-    """An override with quotes where its setting is a text, or a list of them, and it has a number.
+    """Returns an override with quotes around numbers, if its setting is a text or a list of texts.
 
     Args:
-        line: such as ``run_dir=1.10``.
-        config: what is composed of it and others, which knows the settings' types.
+        line: an override, such as ``run_dir=1.10``.
+        config: the composed configuration, which defines the settings' types.
     """
     override = OverridesParser.create().parse_override(line)
     key, _, text = line.partition("=")
-    # What other functions give was not typed.
+    # Functions other than choice() compute their values.
     if override.is_delete() or text.startswith("{") or "(" in text.removeprefix("choice("):
         return line
     quoted = PARTS.sub(lambda part: _quoted(part[0]), text)
@@ -57,7 +57,7 @@ def as_typed(line: str, config: DictConfig) -> str:
 
 
 def _is_text(config: DictConfig, key: str) -> bool:
-    """Whether a setting makes texts of other values, alone or in a list."""
+    """Whether a setting is a text or a list of texts."""
     for value in (True, [True]):
         probe = deepcopy(config)
         try:

@@ -1,4 +1,4 @@
-"""A recipe's docstring in its ``--help``; Hydra imports what lies in this folder when it starts."""
+"""Shows a recipe's docstring in its ``--help``; Hydra imports all modules of this folder."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import sys
 
 from omegaconf import OmegaConf
 
-# Of the script that was started. What looks like a variable there is not one of Hydra's template.
-# Replaced: in a launcher's process Hydra imports this anew for each job.
+# "$" is escaped, since Hydra's help is a template. replace=True, since Hydra imports this module
+# again for each job in a launcher's process.
 OmegaConf.register_new_resolver(
     "recipe",
     lambda: (sys.modules["__main__"].__doc__ or "").strip().replace("$", "$$"),

@@ -1,4 +1,4 @@
-"""Hydra finds this plugin because it lies beside the recipes, in the namespace of its plugins."""
+"""A Hydra sweeper that reports all failed jobs; Hydra finds it in ``hydra_plugins``."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ def run_job(
     """Runs a job of a sweep, in this process or another one.
 
     Args:
-        main: the recipe's, importable by name.
-        cwd: what relative paths start from; processes of a cluster run elsewhere.
-        notes: folder where the job leaves what came of it, in case its launcher never says.
-        config: of the job.
+        main: the recipe's function, importable by name.
+        cwd: working directory; processes of a cluster have another one.
+        notes: folder in which the job saves its result, in case the launcher fails.
+        config: configuration of the job.
 
     Returns:
-        what went wrong, so that the other jobs go on.
+        the job's error, or ``None``; an exception would stop the other jobs.
     """
     if multiprocessing.get_start_method() not in multiprocessing.get_all_start_methods():
-        # joblib's: workers would be told of it at their start and not know it.
+        # joblib sets a start method of its own, which spawned workers do not know.
         multiprocessing.set_start_method("spawn", force=True)
-    # Needs an extra, and Hydra imports this module before a recipe can say which.
+    # Here, since Hydra imports this module before a recipe can report a missing extra.
     from torchrl_bmrl.run.progress import name_lines
 
     problem = None
@@ -53,7 +53,7 @@ def run_job(
         name_lines(str(config.get("run_dir", "")))
         main(config)
     except SystemExit as stop:
-        if isinstance(stop.__cause__, StoppedError | KeyboardInterrupt):  # the whole sweep's
+        if isinstance(stop.__cause__, StoppedError | KeyboardInterrupt):  # stops the whole sweep
             raise
         problem = f"error: {stop.__cause__ or stop}"
     except Exception:
@@ -63,15 +63,15 @@ def run_job(
 
 
 class ReportingSweeper(BasicSweeper):
-    """Hydra's sweeper; at the end it names all jobs that failed, and the exit code is 1."""
+    """Hydra's sweeper, which lists all failed jobs at the end and exits with code 1."""
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
-        """Gives the launcher the recipe as a module.
+        """Imports the recipe as a module for the launcher.
 
-        The functions of a script would be copied to other processes, where a recipe's workers could
-        not find them by their names.
+        Functions of a script would be copied to other processes, in which a recipe's workers could
+        not import them.
         """
         module = importlib.import_module(Path(inspect.getfile(task_function)).stem)
         self.notes = Path(config.hydra.sweep.dir).absolute() / ".jobs"
@@ -80,7 +80,7 @@ class ReportingSweeper(BasicSweeper):
         super().setup(hydra_context=hydra_context, task_function=job, config=config)
 
     def sweep(self, arguments: list[str]) -> Any:
-        """Launches the jobs if all can be composed; exits if any failed."""
+        """Launches the jobs if all are valid; exits if any failed."""
         jobs = self.compose_all(arguments)
         try:
             return self.launch_all(arguments, jobs)
@@ -88,7 +88,7 @@ class ReportingSweeper(BasicSweeper):
             shutil.rmtree(self.notes, ignore_errors=True)
 
     def compose_all(self, arguments: list[str]) -> list[list[str]]:
-        """Each job's overrides; exits, before anything is written, if some are not valid."""
+        """Returns each job's overrides; exits, before anything is written, if any is not valid."""
         assert self.hydra_context is not None
         assert self.config is not None
         loader = self.hydra_context.config_loader
@@ -103,31 +103,31 @@ class ReportingSweeper(BasicSweeper):
                 reasons = [str(e).partition("\n")[0] for e in (error, error.__cause__) if e]
                 problems.append((job, "; ".join(reasons)))
         if problems:
-            end(f"{len(problems)} of {len(jobs)} jobs are not valid, none was started:", problems)
+            end(f"{len(problems)} of {len(jobs)} jobs are not valid; none was started:", problems)
         return jobs
 
     def validate_batch_is_legal(self, batch: Sequence[Sequence[str]]) -> None:
-        """All batches were composed before the first one was launched."""
+        """Does nothing: :meth:`compose_all` has checked all jobs."""
 
     def launch_all(self, arguments: list[str], jobs: list[list[str]]) -> Any:
-        """Launches the jobs; exits if any failed, or their launcher did."""
+        """Launches the jobs; exits if any job or the launcher failed."""
         try:
             batches: list[Sequence[JobReturn]] = super().sweep(arguments)
             found = [job.return_value for batch in batches for job in batch]
-        except Exception as error:  # of the launcher: a process was killed, a cluster is gone
+        except Exception as error:  # the launcher failed: a killed process, a lost cluster
             lost = str(error).strip().partition("\n")[0] or type(error).__name__
             files = [self.notes / str(number) for number in range(len(jobs))]
             found = [
-                file.read_text() or None if file.exists() else f"did not end: {lost}"
+                file.read_text() or None if file.exists() else f"not finished: {lost}"
                 for file in files
             ]
         problems = [(job, x) for job, x in zip(jobs, found, strict=True) if x is not None]
         if problems:
-            end(f"{len(problems)} of {len(jobs)} jobs failed, the others are done:", problems)
+            end(f"{len(problems)} of {len(jobs)} jobs failed; the others are done:", problems)
         return batches
 
 
 def end(summary: str, problems: list[tuple[list[str], str]]) -> NoReturn:
-    """Exits with all of a sweep's problems, each below its job's overrides."""
+    """Exits with the errors of a sweep, each below its job's overrides."""
     lines = [f"{' '.join(job)}\n    {problem}" for job, problem in problems]
     sys.exit("\n".join([summary, *lines]))

@@ -176,7 +176,7 @@ class ObservationStatistics:
 
 
 def observation_parts(task: Task, data: TensorDictBase) -> tuple[str, ...] | None:
-    """Names of the parts that are concatenated; ``None`` for a task with its own transforms.
+    """Returns the names of the concatenated parts; ``None`` for a task with its own transforms.
 
     Args:
         task: the task.

@@ -1,4 +1,4 @@
-"""What a stage's checkpoint holds, and how to make it act again."""
+"""Networks of both stages, and how to build them from a checkpoint."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from torchrl_bmrl.objectives import BCQLoss, MetaDistillationLoss
 from torchrl_bmrl.training.checkpoint import build, load_checkpoint
 
 _SIX_TASKS = {"observation_dim": 33, "action_dim": 7}
-"""Sizes in checkpoints that were written when there were only the six Sawyer tasks."""
+"""Sizes of older checkpoints, which do not contain them."""
 
 
 def make_bcq_loss(
@@ -45,7 +45,7 @@ def make_bcq_loss(
     perturbation: bool = False,
     **options: Any,
 ) -> BCQLoss:
-    """A :class:`BCQLoss` over freshly initialised networks.
+    """Returns a :class:`BCQLoss` over new networks.
 
     Args:
         observation_dim: size of the observation.
@@ -53,7 +53,7 @@ def make_bcq_loss(
         num_cells: widths of the hidden layers of every network.
         num_qvalue_nets: number of critics.
         perturbation: whether there is a perturbation network.
-        **options: of :class:`BCQLoss`.
+        **options: options of :class:`BCQLoss`.
 
     Raises:
         BMRLError: for options that :class:`BCQLoss` refuses.
@@ -73,13 +73,13 @@ def make_bcq_loss(
 
 
 def load_bcq_loss(path: Path) -> tuple[BCQLoss, dict[str, Any]]:
-    """A trained BCQ and its checkpoint's metadata (``task``, ``statistics``, ...).
+    """Loads a trained agent and its checkpoint's metadata (``task``, ``statistics``, ...).
 
     Args:
         path: the checkpoint, such as ``bcq/lift/checkpoint.safetensors`` of a run folder.
 
     Returns:
-        the loss, frozen, and the metadata.
+        the frozen loss and the metadata.
 
     Raises:
         CheckpointError: if the file is missing, damaged, of another kind or of other shapes.
@@ -101,9 +101,9 @@ def load_bcq_loss(path: Path) -> tuple[BCQLoss, dict[str, Any]]:
 
 
 def _with_sizes(options: Any) -> Any:
-    """Options of networks, with the sizes that older checkpoints leave out."""
+    """Adds the sizes that are missing in older checkpoints to the options of networks."""
     if not isinstance(options, dict):
-        return options  # refused when the networks are built
+        return options  # an error is raised when the networks are built
     return _SIX_TASKS | {key: x for key, x in options.items() if key != "target_dtype"}
 
 
@@ -120,7 +120,7 @@ class Student(nn.Module):
         latent_dim: size of the teachers' ``action_latent``; by default twice the action's.
 
     Attributes:
-        prototypes: m that stands for each task, ``(num_tasks, m)``; see :meth:`set_prototypes`.
+        prototypes: representative m of each task, ``(num_tasks, m)``; see :meth:`set_prototypes`.
 
     Raises:
         UnknownNameError: for another encoder.
@@ -167,16 +167,16 @@ class Student(nn.Module):
 
     @torch.no_grad()
     def embed(self, data: TensorDictBase) -> Tensor:
-        """Embedding of each transition, ``(*B, task_latent_dim)``.
+        """Returns the embedding of each transition, ``(*B, task_latent_dim)``.
 
         Args:
-            data: batch ``[*B]`` with what the encoder reads: a transition, or ``task``.
+            data: batch ``[*B]`` with the encoder's inputs: a transition, or ``task``.
         """
         return self.task_encoder(data.select(*self.task_encoder.in_keys)).get("task_latent")
 
     @torch.no_grad()
     def set_prototypes(self, datasets: Sequence[TensorDictBase], kind: str) -> None:
-        """Takes each task's prototype from its training data.
+        """Computes each task's prototype from its training data.
 
         Args:
             datasets: one batch ``[N_i]`` per task, in the order of the tasks.
@@ -190,27 +190,24 @@ class Student(nn.Module):
 
     @torch.no_grad()
     def accuracy(self, data: TensorDictBase) -> float:
-        """Share of transitions whose task the classifier names, in [0, 1].
+        """Returns the classifier's accuracy, in [0, 1].
 
         Args:
-            data: batch ``[*B]`` with what the encoder reads and the class index ``task (*B,)``.
+            data: batch ``[*B]`` with the encoder's inputs and the class index ``task (*B,)``.
         """
         encoded = self.task_encoder(data.select(*self.task_encoder.in_keys))
         logits = self.task_classifier(encoded).get("task_logits")
         return (logits.argmax(-1) == data.get("task")).float().mean().item()
 
     def policy(self, *, num_candidates: int, latent_clip: float | None) -> BCQPolicy:
-        """The distilled policy; it reads ``task_latent``.
+        """Returns the distilled policy, which reads ``task_latent`` and shares the networks.
 
         Args:
             num_candidates: proposals per state, at least 1.
             latent_clip: bound on ``action_latent``, ``None`` for none.
 
-        Returns:
-            a policy of the student's own networks, not of copies.
-
         Raises:
-            BMRLError: for candidates below one.
+            BMRLError: for ``num_candidates`` below one.
         """
         return BCQPolicy(
             self.generator,
@@ -223,7 +220,7 @@ class Student(nn.Module):
     def task_latent_source(
         self, source: str, task: int, demonstration: TensorDictBase | None = None
     ) -> Transform:
-        """The transform that writes ``task_latent`` while the policy acts.
+        """Returns the transform that writes ``task_latent`` while the policy acts.
 
         Args:
             source: ``"prototype"``, ``"online"`` or ``"demonstration"``.
@@ -246,12 +243,12 @@ class Student(nn.Module):
 def make_distillation_loss(
     student: Student, teachers: Sequence[BCQPolicy], **options: Any
 ) -> MetaDistillationLoss:
-    """The loss that distils teachers, one per task, into a student; it trains the student itself.
+    """Returns the loss that distils teachers, one per task, into a student without copying it.
 
     Args:
-        student: made for as many tasks as there are teachers.
-        teachers: trained agents, such as :meth:`BCQPolicy.frozen` gives.
-        **options: of :class:`MetaDistillationLoss`; the latent is the teachers'.
+        student: student for as many tasks as there are teachers.
+        teachers: trained agents, for example from :meth:`BCQPolicy.frozen`.
+        **options: options of :class:`MetaDistillationLoss` except those of the latent.
 
     Raises:
         BMRLError: for options that :class:`MetaDistillationLoss` refuses.
@@ -280,18 +277,18 @@ TASK_ENCODERS = ("transition", "one_hot")
 
 
 def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
-    """A distilled student and its checkpoint's metadata.
+    """Loads a distilled student and its checkpoint's metadata.
 
     Args:
         path: the checkpoint.
 
     Returns:
-        the student, and what was said of it; of that ``tasks``, ``latent_clip``, ``accuracy`` and
-        ``statistics`` are checked.
+        the student and the metadata with valid ``tasks``, ``latent_clip``, ``accuracy`` and
+        ``statistics``.
 
     Raises:
-        CheckpointError: if the file is missing, damaged, of another kind or of other shapes, or
-            says something that is not valid.
+        CheckpointError: if the file is missing, damaged, of another kind or of other shapes, or its
+            metadata are not valid.
 
     Example:
         >>> import tempfile
@@ -320,8 +317,9 @@ def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
     }
     for key, (holds, what) in valid.items():
         if not holds(metadata.get(key)):
-            said = reprlib.repr(metadata.get(key))
-            raise CheckpointError(path, f"{key} is {said}; valid: {what}")
+            raise CheckpointError(
+                path, f"{key} is {reprlib.repr(metadata.get(key))}; valid: {what}"
+            )
     return student, metadata
 
 
@@ -334,7 +332,7 @@ def _is_name(x: Any) -> bool:
 
 
 def _is_task_name(x: Any) -> bool:
-    """Whether a file may be named after a task of this name, also after several, ``"a-b"``."""
+    """Whether a task's name can be part of a file name."""
     return _is_name(x) and re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", x) is not None
 
 

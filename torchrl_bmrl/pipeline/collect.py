@@ -17,9 +17,9 @@ from torchrl_bmrl.tasks import Task
 def collect(run: Run) -> None:
     """Writes ``data/<task>.hdf5`` for every task, and ``data/statistics.json``.
 
-    Tasks with a scripted expert are recorded. The files of the others are imported: actions are
-    scaled to [-1, 1] from the bounds of the environment, or from bounds that all files share, and
-    some episodes are held out. What is there already is kept.
+    Tasks with a scripted expert are recorded. The files of the other tasks are imported: actions
+    are scaled to [-1, 1] from the bounds of the environment, or from the common bounds of all
+    files, and some episodes are held out. Existing files are not written again.
 
     Args:
         run: an open run.
@@ -59,7 +59,7 @@ def collect(run: Run) -> None:
     statistics = write_statistics(run.data_dir, run.tasks)
     for task in run.tasks:
         if task.files is not None and task.make_env is not None:
-            make_env(task, statistics).close()  # a wrong environment is refused before training
+            make_env(task, statistics).close()  # raises an error for a wrong environment
 
 
 def _import_files(run: Run) -> None:

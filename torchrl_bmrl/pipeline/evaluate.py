@@ -1,4 +1,4 @@
-"""Evaluation of a run: episodes from starts that no demonstration had, and the report."""
+"""Evaluation of a run: episodes from new starts, and the report."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def evaluate(run: Run) -> str:
         the table of results as Markdown, and the path of the report.
 
     Raises:
-        BMRLError: if something is missing or damaged.
+        BMRLError: if a file is missing or damaged.
 
     Example:
         >>> from torchrl_bmrl.pipeline import Settings
@@ -88,7 +88,7 @@ def evaluate(run: Run) -> str:
     return f"{table}\nreport: {run.folder / 'report.html'}"
 
 
-def keep_rows(
+def evaluate_once(
     run: Run,
     task: str,
     policy: str,
@@ -97,22 +97,22 @@ def keep_rows(
     source: str = "",
     report: Report,
 ) -> list[ResultRow]:
-    """The evaluation's episodes of one task, policy and source of m, played once.
+    """Plays the evaluation's episodes of one task, policy and source of m, or loads their file.
 
     Args:
         run: the run.
-        task: whose episodes.
-        policy: its name in tables.
-        play: plays episodes that start with the given seeds.
-        source: of m, for the distilled policy.
-        report: called with the number of steps if the episodes are read back.
+        task: name of the task.
+        policy: name of the policy in tables.
+        play: plays one episode for each of the given seeds.
+        source: source of m, for the distilled policy.
+        report: called with the number of steps if the episodes are loaded.
     """
     name = "-".join(filter(None, (task, policy, source)))
     path = run.folder / "evaluation" / f"{name}.csv"
     episodes = run.settings.evaluate.episodes
     if path.exists():
         report(episodes * run.horizon(run.task(task)))
-        log.debug("%s: read back", path)
+        log.debug("%s: loaded", path)
         return read_results(path)
     outcomes = play([run.seed("evaluate", task, i) for i in range(episodes)])
     rows = [
@@ -133,7 +133,7 @@ def keep_rows(
 
 
 def evaluate_job(job: tuple[Run, tuple[str, str, str]], report: Report) -> list[ResultRow]:
-    """All episodes of one task, policy and source of m."""
+    """Evaluates one policy, with one source of m, on one task."""
     run, (name, policy_name, source) = job
     task, count = run.task(name), run.settings.evaluate.num_candidates
 
@@ -151,19 +151,19 @@ def evaluate_job(job: tuple[Run, tuple[str, str, str]], report: Report) -> list[
         statistics = ObservationStatistics.from_lists(metadata["statistics"])
         return run.play(task, policy, transform, seeds=seeds, statistics=statistics, report=report)
 
-    return keep_rows(run, name, policy_name, play, source=source, report=report)
+    return evaluate_once(run, name, policy_name, play, source=source, report=report)
 
 
 def source_of_m(
     run: Run, name: str, student: Student, metadata: dict[str, Any], source: str
 ) -> Transform:
-    """The transform that writes ``task_latent`` for a task while the distilled policy acts."""
+    """Returns the transform that writes ``task_latent`` for a task."""
     demonstration = held_out_episode(run, name) if source == "demonstration" else None
     return student.task_latent_source(source, metadata["tasks"].index(name), demonstration)
 
 
 def held_out_episode(run: Run, name: str) -> TensorDictBase:
-    """The demonstration that m may come from; an exported policy contains its own."""
+    """Returns the demonstration for the source ``demonstration``; exported policies contain one."""
     if run.settings.evaluate.policy:
         state, _ = load_checkpoint(run.student_path, kind="student")
         return TensorDict(state["demonstrations"][name]).auto_batch_size_(1)
@@ -172,7 +172,7 @@ def held_out_episode(run: Run, name: str) -> TensorDictBase:
 
 
 def expert_outcomes(run: Run, name: str, seeds: list[int]) -> list[EpisodeOutcome]:
-    """Episodes of the expert: fresh ones from the evaluation's starts, or its demonstrations."""
+    """Returns the expert's outcomes: new episodes from the seeds, or its demonstrations."""
     task, collect = run.task(name), run.settings.collect
     if run.settings.evaluate.expert_rollouts and task.record is not None:
         options = {"noise": collect.noise, "gains": collect.gains, **task.options}

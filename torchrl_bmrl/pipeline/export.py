@@ -65,13 +65,13 @@ A linear layer names the task of {accuracy:.2%} of the held-out transitions from
 def export(run: Run) -> None:
     """Writes ``policy.safetensors``, ``policy.md`` and ``policy.onnx`` into the run folder.
 
-    Of an exported policy (``evaluate.policy``) only the ONNX file is written.
+    For an exported policy (``evaluate.policy``) only the ONNX file is written.
 
     Args:
         run: an open run with both stages.
 
     Raises:
-        BMRLError: if something is missing or damaged.
+        BMRLError: if a file is missing or damaged.
 
     Example:
         >>> from torchrl_bmrl.pipeline import Settings
@@ -133,7 +133,7 @@ def _write_policy(run: Run, student: Student, metadata: dict[str, Any]) -> None:
 
 
 def _write_onnx(run: Run, student: Student, metadata: dict[str, Any]) -> None:
-    """Writes the policy as an ONNX file whose metadata hold each task's point of m."""
+    """Writes the policy as an ONNX file whose metadata contain each task's point of m."""
     path = run.folder / "policy.onnx"
     policy = student.policy(
         num_candidates=run.settings.evaluate.num_candidates, latent_clip=metadata["latent_clip"]

@@ -38,7 +38,7 @@ _PAGE = (
 
 
 def evaluate_held_out(run: Run) -> Table:
-    """Judges both stages on held-out demonstrations and writes ``held_out.csv``.
+    """Evaluates both stages on held-out demonstrations and writes ``held_out.csv``.
 
     Args:
         run: an open run with both stages.
@@ -82,7 +82,7 @@ def evaluate_held_out(run: Run) -> Table:
 
 
 def held_out_job(job: tuple[Run, str], report: Report) -> dict[str, str | float]:
-    """The numbers of one task; computed once."""
+    """Computes the numbers of one task, or loads their file."""
     run, name = job
     path = run.folder / "evaluation" / f"{name}-held_out.csv"
     if path.exists():
@@ -97,15 +97,15 @@ def held_out_job(job: tuple[Run, str], report: Report) -> dict[str, str | float]
     teacher = BCQPolicy.frozen(loss, num_candidates=loss.num_candidates)
     policy = student.policy(num_candidates=loss.num_candidates, latent_clip=metadata["latent_clip"])
 
-    def told(data: TensorDictBase) -> TensorDictBase:
-        """The data with the task's prototype as m, now and next."""
+    def with_prototype(data: TensorDictBase) -> TensorDictBase:
+        """Adds the task's prototype as m, also under ``"next"``."""
         m = student.prototypes[index].expand(len(data), -1)
         after = data["next"].copy().set("task_latent", m)
         return data.copy().set("task_latent", m).set("next", after)
 
     acts = [
         each(data.select(*each.in_keys))["action"]
-        for each, data in ((teacher, valid), (policy, told(valid)))
+        for each, data in ((teacher, valid), (policy, with_prototype(valid)))
     ]
     train, settings = run.transitions(name, "train"), run.settings
     options: dict[str, Any] = {
@@ -116,7 +116,7 @@ def held_out_job(job: tuple[Run, str], report: Report) -> dict[str, str | float]
         "report": report,
     }
     estimates = {}
-    for key, each, data in (("bcq", teacher, train), ("distilled", policy, told(train))):
+    for key, each, data in (("bcq", teacher, train), ("distilled", policy, with_prototype(train))):
         torch.manual_seed(run.seed("held out", name, "critic"))
         estimates[key] = estimate_return(each, data, where=f"{key} on {name}", **options)
     row: dict[str, str | float] = {

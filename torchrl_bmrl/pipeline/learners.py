@@ -1,4 +1,4 @@
-"""The agents of stage 1 while they are trained: one alone, or several as one stacked loss."""
+"""Agents of stage 1 in training: one alone, or several as one stacked loss."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ NOT_OF_THE_LOSS = (
 
 
 def loss_options(settings: BCQSettings) -> dict[str, Any]:
-    """The settings that are options of :func:`~torchrl_bmrl.pipeline.agents.make_bcq_loss`."""
+    """Returns the settings that are options of :func:`.make_bcq_loss`."""
     return {name: x for name, x in vars(settings).items() if name not in NOT_OF_THE_LOSS}
 
 
 def make_optimizers(loss: LossModule, settings: BCQSettings) -> dict[str, Adam]:
-    """An optimizer for each network of a BCQ loss, in update order."""
+    """Returns an optimizer for each network of a BCQ loss, in update order."""
     networks = ["generator", "qvalue_network"]
     networks += ["perturbation_network"] if settings.perturbation else []
     return {
@@ -63,7 +63,7 @@ def make_optimizers(loss: LossModule, settings: BCQSettings) -> dict[str, Adam]:
 def make_update(
     loss: LossModule, optimizers: dict[str, Adam], targets: SoftUpdate, max_norm: float | None
 ) -> Update:
-    """One update of every network that has an optimizer, in their order, then of the targets."""
+    """Returns an update of each network with an optimizer, in their order, and of the targets."""
 
     def update(batch: TensorDictBase) -> dict[str, Tensor]:
         metrics: dict[str, Tensor] = {}
@@ -81,7 +81,10 @@ def make_update(
 def choose_updates(
     run: Run, loss: LossModule, optimizers: dict[str, Adam], targets: SoftUpdate
 ) -> Callable[[int], Update]:
-    """From the number of an update to the update; the first ones may train the generator alone."""
+    """Returns a function that maps the number of an update to the update.
+
+    The first ``generator_warmup`` updates train only the generator.
+    """
     settings, bcq = run.settings, run.settings.bcq
 
     def accelerated(*networks: str) -> Update:
@@ -112,7 +115,7 @@ class Agents:
         settings, self.device = run.settings.bcq, run.settings.device
         self.options = loss_options(settings) | sizes
         losses = []
-        for name in self.names:  # an agent starts the same alone and in a stack
+        for name in self.names:  # the same initial networks alone and in a stack
             torch.manual_seed(run.seed("bcq", name))
             losses.append(make_bcq_loss(**self.options))
         if len(losses) == 1:
@@ -124,32 +127,34 @@ class Agents:
             self.path = run.folder / "bcq" / "stacked.safetensors"
         self.loss.to(self.device)
         self.optimizers = make_optimizers(self.loss, settings)
-        self.targets = SoftUpdate(self.loss, tau=settings.tau)  # sets them to the critics
+        self.targets = SoftUpdate(self.loss, tau=settings.tau)  # copies the critics
         self.updates = 0
         self.evaluations: dict[str, list[dict]] = {name: [] for name in self.names}
-        self.diverged: dict[str, str] = {}  # what was not finite, by agent
+        self.diverged: dict[str, str] = {}  # error message by agent
 
     def agent(self, name: str) -> BCQLoss:
-        """An agent's loss in its present state."""
+        """Returns an agent's current loss."""
         stacked = isinstance(self.loss, StackedLoss)
         return self.loss.member(self.names.index(name)) if stacked else self.loss
 
     @property
-    def well(self) -> list[str]:
+    def healthy(self) -> list[str]:
         """Agents that have not diverged."""
         return [name for name in self.names if name not in self.diverged]
 
     def check(
         self, metrics: dict[str, Tensor], batch: TensorDictBase, update: int
     ) -> dict[str, dict[str, float]]:
-        """Metrics of every agent that is well; one that diverged keeps its last checkpoint.
+        """Returns the metrics of every agent that has not diverged.
+
+        An agent that diverges is not saved any more.
 
         Raises:
             BMRLError: if all agents have diverged.
         """
         columns = {key: torch.atleast_1d(value).tolist() for key, value in metrics.items()}
         rows = {}
-        for name in self.well:
+        for name in self.healthy:
             i = self.names.index(name)
             rows[name] = {key: column[i] for key, column in columns.items()}
             mine = batch if self.kind == "bcq" else batch[i]
@@ -160,15 +165,15 @@ class Agents:
                 check_proposals(self.proposals(name, mine), mine["action"], where)
             except BMRLError as error:
                 self.diverged[name] = str(error)
-                if not self.well:
+                if not self.healthy:
                     raise
-                log.warning(f"{error}; it is frozen and the others go on")
+                log.warning(f"{error}; training continues without it")
                 del rows[name]
         return rows
 
     @torch.no_grad()
     def proposals(self, name: str, batch: TensorDictBase) -> Tensor:
-        """Some of an agent's candidates, ``(states, candidates, action_dim)``."""
+        """Returns candidates of an agent, ``(states, candidates, action_dim)``."""
         loss = self.agent(name)
         states = batch[:32].select(*loss.observation_keys)
         device = torch.device(self.device)
@@ -188,13 +193,13 @@ class Agents:
             self.evaluations = {self.names[0]: kept["evaluations"]}
             return
         self.evaluations, self.diverged = kept["evaluations"], kept["diverged"]
-        for name in self.well:
+        for name in self.healthy:
             path = self.run.agent_path(name)
             if not path.exists() or load_checkpoint(path, kind="bcq")[1]["updates"] != self.updates:
                 self.save_agent(name)  # the process was killed between the two files
 
     def save(self, update: int) -> None:
-        """Saves what training resumes from, and every agent that is well."""
+        """Saves the state of the training, and every agent that has not diverged."""
         self.updates = update
         if self.kind == "bcq":
             metadata = self.metadata(self.names[0])
@@ -211,11 +216,11 @@ class Agents:
             keep=self.run.settings.keep_checkpoints,
         )
         if self.kind != "bcq":
-            for name in self.well:
+            for name in self.healthy:
                 self.save_agent(name)
 
     def save_agent(self, name: str) -> None:
-        """Saves a member of a stack in a file of its own, for readers."""
+        """Saves a member of a stack as an agent's checkpoint."""
         state = {"module": self.agent(name).state_dict()}
         save_checkpoint(self.run.agent_path(name), state, self.metadata(name))
 

@@ -40,15 +40,15 @@ Result = TypeVar("Result")
 
 
 class Run:
-    """A run folder as an object; ``with run:`` creates or opens it and locks it.
+    """A run folder as an object; ``with run:`` creates or opens the folder and locks it.
 
-    Workers receive a copy by pickle. Everything that it returns is read from the folder.
+    Workers receive a copy by pickle. All results are read from the folder.
 
     Args:
-        settings: of the run. A YAML file of tasks is read and stored in the folder's settings.
+        settings: settings of the run. A YAML file of tasks is stored in the folder's settings.
 
     Attributes:
-        settings: the settings, with tasks and numbers of episodes written out.
+        settings: the settings, with tasks and numbers of episodes filled in.
         folder: the run folder.
         tasks: the tasks; a task's class index is its position.
 
@@ -65,7 +65,7 @@ class Run:
         False
     """
 
-    _opened: ExitStack | None = None  # the lock, which no copy of the run has
+    _opened: ExitStack | None = None  # the lock; copies of the run do not have it
 
     def __init__(self, settings: Settings) -> None:
         tasks = list(SIX_TASKS) if settings.tasks is None else settings.tasks
@@ -84,12 +84,12 @@ class Run:
                 raise ConfigError(f"only is {only}; valid: some of {list(self.names)}, each once")
 
     def __enter__(self) -> Run:
-        # Jobs that train only some tasks leave the other tasks and everything else to other jobs.
+        # Jobs that train only some tasks lock these, so that other jobs can train the rest.
         parts = self.settings.only or ["run", *self.names]
         opened = ExitStack()
         opened.enter_context(hold_run(self.folder, asdict(self.settings), parts))
         self._opened = opened
-        gc.freeze()  # imported modules stay; robosuite would search them at every env.close()
+        gc.freeze()  # robosuite collects garbage at every env.close(): leave imported modules out
         return self
 
     def __exit__(self, *error: Any) -> bool | None:
@@ -131,10 +131,10 @@ class Run:
             )
 
     def task(self, name: str) -> Task:
-        """The task of a name.
+        """Returns a task of the run.
 
         Args:
-            name: of a task of the run.
+            name: name of the task.
 
         Raises:
             UnknownNameError: for a name that is not a task of the run.
@@ -144,10 +144,10 @@ class Run:
         return self.tasks[self.names.index(name)]
 
     def composition(self, name: str) -> Task:
-        """The task of several of this run's tasks in a row.
+        """Returns a composition of the run's tasks.
 
         Args:
-            name: of the tasks, such as ``"reach-lift"``.
+            name: names of the tasks, such as ``"reach-lift"``.
 
         Raises:
             ConfigError: for a name that is not a task of the run, or tasks that cannot be composed.
@@ -169,18 +169,18 @@ class Run:
         return self.folder / "distill" / "checkpoint.safetensors"
 
     def demonstrations(self, name: str) -> Path:
-        """The file with a task's demonstrations.
+        """Returns the file with a task's demonstrations.
 
         Args:
-            name: of the task.
+            name: name of the task.
         """
         return demonstration_path(self.data_dir, name)
 
     def agent_path(self, name: str) -> Path:
-        """Checkpoint of a stage-1 agent; the first agent of a task has the task's name.
+        """Returns the checkpoint of a stage-1 agent.
 
         Args:
-            name: of the agent.
+            name: name of the agent; a task's first agent has the task's name.
         """
         return self.folder / "bcq" / name / "checkpoint.safetensors"
 
@@ -190,10 +190,10 @@ class Run:
         return read_statistics(self.data_dir)
 
     def transitions(self, name: str, split: str) -> TensorDictBase:
-        """A task's normalised transitions, ``[N]``.
+        """Returns a task's normalised transitions, ``[N]``.
 
         Args:
-            name: of the task.
+            name: name of the task.
             split: ``"train"`` or ``"valid"``.
         """
         index = self.names.index(name)
@@ -202,30 +202,30 @@ class Run:
         )
 
     def teacher(self, name: str) -> BCQLoss:
-        """The trained agent of a task, frozen.
+        """Returns the trained agent of a task, frozen.
 
         Args:
-            name: of the task.
+            name: name of the task.
         """
         return load_bcq_loss(self.agent_path(name))[0]
 
     def student(self) -> tuple[Student, dict[str, Any]]:
-        """The distilled student and its checkpoint's metadata."""
+        """Returns the distilled student and its checkpoint's metadata."""
         return load_student(self.student_path)
 
     def once(
         self, file: str, read: Callable[[Path], Result], make: Callable[[Path], Any]
     ) -> Result:
-        """The content of a file that is made once and read back afterwards.
+        """Returns the content of a file, which is written first if it does not exist.
 
         Args:
             file: path below the run folder.
             read: reads the file.
-            make: writes the file, as a whole or not at all.
+            make: writes the file atomically.
         """
         path = self.folder / file
         if path.exists():
-            log.debug("%s: read back", path)
+            log.debug("%s: loaded", path)
         else:
             make(path)
         return read(path)
@@ -233,7 +233,7 @@ class Run:
     # -- work ----------------------------------------------------------------------------------
 
     def check_open(self) -> None:
-        """Checks that this process holds the folder.
+        """Checks that this process has opened and locked the folder.
 
         Raises:
             BMRLError: if the run is not open.
@@ -242,7 +242,7 @@ class Run:
             raise BMRLError(f"{self.folder} is not open; valid: with Run(settings) as run: ...")
 
     def seed(self, *names: str | int) -> int:
-        """A seed for one purpose, derived from the run's seed."""
+        """Derives a seed for one purpose from the run's seed."""
         return derive_seed(self.settings.seed, *names)
 
     def jobs(
@@ -255,19 +255,20 @@ class Run:
         unit: str,
         workers: int | None = None,
     ) -> list[Result]:
-        """Calls ``function((run, job), report)`` for every job, over the run's workers.
+        """Calls ``function((run, job), report)`` for every job in the run's workers.
+
+        See :func:`~torchrl_bmrl.run.workers.run_jobs`.
 
         Args:
-            function: importable by name.
+            function: runs one job; it must be importable by name.
             jobs: the jobs.
-            total: units over all jobs, for the progress bar.
-            description: of the work.
-            unit: what is counted, in the singular.
-            workers: number of processes; by default the settings'.
+            total: units of all jobs, for the progress.
+            description: name of the jobs.
+            unit: name of a unit, in the singular.
+            workers: number of processes; by default that of the settings.
 
         Raises:
-            BMRLError: if the run is not open, and as
-                :func:`~torchrl_bmrl.run.workers.run_jobs`.
+            BMRLError: if the run is not open, or a job fails.
         """
         self.check_open()
         return run_jobs(
@@ -280,12 +281,12 @@ class Run:
         )
 
     def make_env(self, task: Task, *transforms: Transform, num_envs: int) -> TransformedEnv:
-        """A task's environment with this run's normalisation.
+        """Returns a task's environment with this run's normalisation.
 
         Args:
-            task: of this run, or one of its compositions.
-            *transforms: appended, as in :func:`~torchrl_bmrl.envs.transforms.make_env`.
-            num_envs: number of episodes side by side.
+            task: a task of this run, or a composition.
+            *transforms: appended transforms.
+            num_envs: number of parallel episodes.
         """
         return make_env(task, self.statistics, *transforms, num_envs=num_envs)
 
@@ -298,15 +299,15 @@ class Run:
         statistics: ObservationStatistics | None = None,
         report: Report = lambda steps: None,
     ) -> list[EpisodeOutcome]:
-        """Plays one episode per seed, all side by side.
+        """Plays one episode per seed, all in parallel.
 
         Args:
-            task: of this run, or one of its compositions.
+            task: a task of this run, or a composition.
             policy: writes ``action``.
             *transforms: appended to the environment, such as a source of ``task_latent``.
-            seeds: of the episodes.
-            statistics: of the policy's observation; by default this run's.
-            report: called with the number of steps done.
+            seeds: seeds of the episodes.
+            statistics: statistics of the policy's observation; by default this run's.
+            report: called with the number of new steps.
         """
         statistics = statistics or self.statistics
         with closing(make_env(task, statistics, *transforms, num_envs=len(seeds))) as env:
@@ -329,7 +330,7 @@ class Run:
 
 
 def _with_run_options(task: Task, settings: Settings, tasks: Sequence[Task]) -> Task:
-    """The task with the run's robot and stepper, if it has these options."""
+    """Returns the task with the run's robot and stepper, if it has these options."""
     if settings.robot and not any("robot" in each.options for each in tasks):
         raise ConfigError(f"robot is {settings.robot}; valid for tasks without robosuite: null")
     chosen = {"stepper": settings.stepper, "robot": settings.robot}
@@ -338,7 +339,7 @@ def _with_run_options(task: Task, settings: Settings, tasks: Sequence[Task]) -> 
 
 
 def _check_names(settings: Settings, names: Sequence[str]) -> None:
-    """Refuses settings of tasks that do not exist; those of other registered tasks are ignored."""
+    """Raises an error for settings of unknown tasks; other registered tasks are allowed."""
     episodes, after = settings.collect.train_episodes, settings.collect.after
     parts = [part for entries in after.values() for entry in entries for part in entry.split("-")]
     for name in [*episodes, *after, *filter(None, parts)]:
@@ -347,7 +348,7 @@ def _check_names(settings: Settings, names: Sequence[str]) -> None:
 
 
 def _train_episodes(settings: Settings, tasks: Sequence[Task]) -> dict[str, int]:
-    """Number of episodes to record for each task."""
+    """Returns the number of episodes to record for each task."""
     given = settings.collect.train_episodes
     recorded = [task.name for task in tasks if task.record is not None]
     for name in recorded:
@@ -356,6 +357,6 @@ def _train_episodes(settings: Settings, tasks: Sequence[Task]) -> dict[str, int]
                 f"collect.train_episodes has {', '.join(given) or 'nothing'}; valid: a number "
                 f"for {name}, or for default"
             )
-    # Numbers for tasks that the run leaves out stay, as in the folders of earlier versions.
+    # Numbers for tasks that are not in the run stay, as in folders of earlier versions.
     named = {name: number for name, number in given.items() if name != "default"}
     return {name: given.get(name, given.get("default", 0)) for name in recorded} | named

@@ -31,15 +31,15 @@ class CollectSettings:
         6
     """
 
-    # By task; "default" is for the others.
+    # Number by task; "default" is for the other tasks.
     train_episodes: dict[str, int] = setting(
         {"default": 60, **dict.fromkeys(SIX_TASKS, 60), "lift": 80}, above=0
     )
-    valid_episodes: int = setting(6, above=0)  # of each task, held out
-    noise: float = setting(0.2, at_least=0)  # standard deviation on every action dimension
-    # By task: what the expert does before an episode begins, in turn. Starts as in a composition.
+    valid_episodes: int = setting(6, above=0)  # held-out episodes of each task
+    noise: float = setting(0.2, at_least=0)  # standard deviation in each action dimension
+    # By task: tasks whose experts act before an episode, in turn, for starts as in a composition.
     after: dict[str, list[str]] = field(default_factory=dict)
-    gains: ExpertGains = field(default_factory=ExpertGains)  # of the experts' controllers
+    gains: ExpertGains = field(default_factory=ExpertGains)  # gains of the experts
 
 
 @dataclass
@@ -51,28 +51,28 @@ class BCQSettings:
         1000
     """
 
-    epochs: int = setting(5, above=0)  # an evaluation follows each
-    updates_per_epoch: int = setting(1000, above=0)  # of every network
-    eval_episodes: int = setting(3, above=0)  # after each epoch, for the curves
-    batch_size: int = setting(128, above=0)  # transitions
-    lr: float = setting(1e-3, above=0)  # of Adam
+    epochs: int = setting(5, above=0)  # the agents are evaluated after each
+    updates_per_epoch: int = setting(1000, above=0)  # updates of each network
+    eval_episodes: int = setting(3, above=0)  # episodes after each epoch, for the curves
+    batch_size: int = setting(128, above=0)  # transitions per update
+    lr: float = setting(1e-3, above=0)  # learning rate of Adam
     num_cells: list[int] = setting([256, 256], above=0)  # widths of the hidden layers
-    num_qvalue_nets: int = setting(2, above=0)  # critics of an agent
-    num_candidates: int = setting(10, above=0)  # in the target
+    num_qvalue_nets: int = setting(2, above=0)  # critics of each agent
+    num_candidates: int = setting(10, above=0)  # proposals in the critics' target
     lmbda: float = setting(0.75, at_least=0, at_most=1)  # weight of the critics' minimum
     latent_clip: float | None = setting(0.5, above=0)  # null turns it off
-    kl_weight: float = setting(0.5, at_least=0)  # in the generator's loss
-    kl_reduction: str = setting("mean", choices=KL_REDUCTIONS)  # over the latent's dimensions
-    gamma: float = setting(0.99, at_least=0, at_most=1)  # discount
-    tau: float = setting(0.005, above=0, at_most=1)  # step of the target networks
-    perturbation: bool = False  # the paper has none
-    max_perturbation: float = setting(0.05, at_least=0)  # bound on it
-    value_bounds: tuple[float, float] | None = None  # of the next states' value
-    loss_function: str = setting("l2", choices=LOSS_FUNCTIONS)  # of the critics
-    generator_warmup: int = setting(0, at_least=0)  # updates of the generator alone at the start
-    critic_grad_clip: float | None = setting(None, above=0)  # norm of the critics' gradient
-    seeds: int = setting(1, above=0)  # agents per task; later ones are under bcq/<task>-<seed>
-    stacked: bool = False  # all agents in one program, for a GPU; false: one process each
+    kl_weight: float = setting(0.5, at_least=0)  # weight of the KL term in the generator's loss
+    kl_reduction: str = setting("mean", choices=KL_REDUCTIONS)  # reduction over the latent
+    gamma: float = setting(0.99, at_least=0, at_most=1)  # discount factor
+    tau: float = setting(0.005, above=0, at_most=1)  # update rate of the target networks
+    perturbation: bool = False  # perturbation network; none in the paper
+    max_perturbation: float = setting(0.05, at_least=0)  # bound on the perturbation
+    value_bounds: tuple[float, float] | None = None  # bounds of the next value
+    loss_function: str = setting("l2", choices=LOSS_FUNCTIONS)  # loss of the critics
+    generator_warmup: int = setting(0, at_least=0)  # first updates, of the generator only
+    critic_grad_clip: float | None = setting(None, above=0)  # bound on the gradient's norm
+    seeds: int = setting(1, above=0)  # agents per task; further ones: bcq/<task>-<seed>
+    stacked: bool = False  # all agents in one program, for a GPU; else one process each
 
 
 @dataclass
@@ -84,28 +84,28 @@ class DistillSettings:
         'set'
     """
 
-    updates: int = setting(12_000, above=0)  # of all networks together
-    batch_size: int = setting(64, above=0)  # of each task
-    lr: float = setting(1e-3, above=0)  # of Adam
+    updates: int = setting(12_000, above=0)  # number of updates
+    batch_size: int = setting(64, above=0)  # transitions of each task per update
+    lr: float = setting(1e-3, above=0)  # learning rate of Adam
     cosine: bool = True  # the learning rate decays to zero
     num_cells: list[int] = setting([256, 256], above=0)  # widths of the hidden layers
-    task_encoder: str = setting("transition", choices=TASK_ENCODERS)  # what m is computed from
+    task_encoder: str = setting("transition", choices=TASK_ENCODERS)  # input of the encoder
     task_latent_dim: int = setting(2, above=0)  # size of m
-    context: str = setting("set", choices=CONTEXTS)  # transitions that m comes from
-    context_fraction: float = setting(0.5, at_least=0, at_most=1)  # of contexts that are sets
-    context_size: int = setting(8, above=0)  # transitions of a set
+    context: str = setting("set", choices=CONTEXTS)  # transitions that m is computed from
+    context_fraction: float = setting(0.5, at_least=0, at_most=1)  # share of set contexts
+    context_size: int = setting(8, above=0)  # transitions in a set
     # Terms whose gradient trains the encoder.
     encoder_terms: list[str] = setting(list(ENCODER_TERMS), choices=ENCODER_TERMS)
-    classification_weight: float = setting(1.0, at_least=0)  # of the cross-entropy of the task
-    generator_weight: float = setting(1.0, at_least=0)  # of the distance to the teachers' actions
-    direction_weight: float = setting(1.0, at_least=0)  # of the critics' gradients' directions
-    qvalue_weight: float = setting(1.0, at_least=0)  # of the distance to the teachers' values
-    latent_norm_weight: float = setting(2e-3, at_least=0)  # of the squared norm of m
-    metric_weight: float = setting(0.0, at_least=0)  # of the triplet loss on m
-    metric_margin: float = setting(1.0, at_least=0)  # of the triplet loss
-    isometry_weight: float = setting(1.0, at_least=0)  # distances in m follow rewards and actions
-    normalise_qvalue: bool = True  # by each teacher's mean and deviation
-    prototype: str = setting("mean", choices=("mean", "medoid"))  # point of m for a task
+    classification_weight: float = setting(1.0, at_least=0)  # weight of the task's cross-entropy
+    generator_weight: float = setting(1.0, at_least=0)  # weight of the actions' loss
+    direction_weight: float = setting(1.0, at_least=0)  # weight of the gradient direction
+    qvalue_weight: float = setting(1.0, at_least=0)  # weight of the values' loss
+    latent_norm_weight: float = setting(2e-3, at_least=0)  # weight of the squared norm of m
+    metric_weight: float = setting(0.0, at_least=0)  # weight of the triplet loss on m
+    metric_margin: float = setting(1.0, at_least=0)  # margin of the triplet loss
+    isometry_weight: float = setting(1.0, at_least=0)  # weight of the isometry of m
+    normalise_qvalue: bool = True  # with each teacher's mean and deviation
+    prototype: str = setting("mean", choices=("mean", "medoid"))  # a task's point of m
 
 
 @dataclass
@@ -117,9 +117,9 @@ class EvaluateSettings:
         ['prototype']
     """
 
-    episodes: int = setting(20, above=0)  # of each task and policy
-    num_candidates: int = setting(100, above=0)  # actions that a policy chooses from
-    # Where the distilled policy takes m from.
+    episodes: int = setting(20, above=0)  # episodes per task and policy
+    num_candidates: int = setting(100, above=0)  # proposals that a policy chooses from
+    # Sources of m for the distilled policy.
     latent_sources: list[str] = setting(["prototype"], choices=LATENT_SOURCES, unique=True)
     policy: str | None = None  # an exported policy's file, evaluated alone
     expert_rollouts: bool = False  # false: the expert's rows are its demonstrations
@@ -127,7 +127,7 @@ class EvaluateSettings:
 
 @dataclass
 class Settings:
-    """Everything that decides a run; ``config.yaml`` in the run folder is one of these.
+    """All settings of a run; ``config.yaml`` in the run folder contains them.
 
     Example:
         >>> settings = Settings(tasks=["reach", "lift"], bcq=BCQSettings(epochs=2))
@@ -136,25 +136,25 @@ class Settings:
         12000
     """
 
-    preset: str = "quick"  # a name of settings
-    ablation: str = "none"  # a name of changes to a preset
-    seed: int = 0  # of everything random
-    run_dir: str = "runs/mine"  # the folder of the run
-    base: str | None = None  # another run's folder: its files are reused where settings agree
+    preset: str = "quick"  # name of the preset
+    ablation: str = "none"  # name of the ablation
+    seed: int = 0  # seed of all random numbers
+    run_dir: str = "runs/mine"  # folder of the run
+    base: str | None = None  # folder of a run whose files are reused if the settings agree
     tasks: Any = None  # names, or a YAML file of tasks; null: the six Sawyer tasks
     robot: str | None = None  # arm of the robosuite tasks; null: the task's own
     only: list[str] | None = None  # tasks of this job of train_bcq.py; other jobs train the rest
-    # processes; no result depends on them
+    # Number of processes; no result depends on it.
     workers: int = field(default_factory=available_cores, metadata=setting(above=0).metadata)
-    stepper: str = setting("fast", choices=STEPPERS)  # of robosuite; no result depends on it
-    device: str = "cpu"  # of training; episodes are played on the CPU
-    compile: bool = False  # compiles the updates with torch.compile in half a minute
-    cudagraphs: bool = False  # captures the updates, on a GPU
-    logger: str = setting("csv", choices=LOGGERS)  # of the losses
-    verbose: bool = False  # also logs what is saved, read back and resumed
+    stepper: str = setting("fast", choices=STEPPERS)  # of robosuite; the results are equal
+    device: str = "cpu"  # device of training; episodes are played on the CPU
+    compile: bool = False  # compile the updates, which takes half a minute
+    cudagraphs: bool = False  # capture the updates as CUDA graphs
+    logger: str = setting("csv", choices=LOGGERS)  # logger of the losses
+    verbose: bool = False  # also log each file that is saved, loaded or resumed
     log_interval: int = setting(100, above=0)  # updates between two rows of losses
     checkpoint_interval: int = setting(1000, above=0)  # updates between two checkpoints
-    keep_checkpoints: int = setting(2, above=0)  # the newest ones, in case one is damaged
+    keep_checkpoints: int = setting(2, above=0)  # number of checkpoints, in case one is damaged
     collect: CollectSettings = field(default_factory=CollectSettings)  # demonstrations
     bcq: BCQSettings = field(default_factory=BCQSettings)  # stage 1
     distill: DistillSettings = field(default_factory=DistillSettings)  # stage 2

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 def stage1(run: Run) -> None:
     """Trains the agents of every task, or of the tasks in ``only``.
 
-    Each agent is trained in a process of its own, or all are stacked in this one.
+    Each agent is trained in its own process, or all are stacked in this process.
 
     Args:
         run: an open run, with demonstrations.
@@ -61,12 +61,7 @@ def stage1(run: Run) -> None:
 
 
 def train_job(job: tuple[Run, dict[str, str]], report: Report) -> None:
-    """Trains agents on their tasks' demonstrations, or resumes from their checkpoint.
-
-    Args:
-        job: the run, and the task of each agent by the agent's name.
-        report: called with the number of updates done since its last call.
-    """
+    """Trains agents (tasks by agent name) on their tasks' demonstrations."""
     run, agents = job
     datasets = [run.transitions(task, "train") for task in agents.values()]
     options: dict[str, Any] = {
@@ -81,20 +76,20 @@ def train_job(job: tuple[Run, dict[str, str]], report: Report) -> None:
 
 
 def sizes_of(data: TensorDictBase) -> dict[str, int]:
-    """Sizes of the observation and the action, by the names of the networks' options."""
+    """Returns the sizes of observation and action, as options of networks."""
     return {f"{key}_dim": data[key].shape[-1] for key in ("observation", "action")}
 
 
 def train_agents(
     run: Run, agents: dict[str, str], buffer: ReplayBuffer, report: Report, *, sizes: dict[str, int]
 ) -> None:
-    """Trains agents on samples of a buffer.
+    """Trains agents on samples of a buffer, or resumes from their checkpoint.
 
     Args:
         run: the run.
         agents: the task of each agent by the agent's name.
-        buffer: samples are ``[batch]`` for one agent and ``[agents, batch]`` for more.
-        report: called with the number of updates done since its last call.
+        buffer: samples are ``[batch]`` for one agent and ``[agents, batch]`` for several.
+        report: called with the number of new updates.
         sizes: ``observation_dim`` and ``action_dim``.
 
     Raises:
@@ -143,9 +138,9 @@ def train_agents(
 
 
 def _evaluate_epoch(run: Run, trained: Agents, update: int) -> None:
-    """Plays every agent that is well after an epoch, for the curves."""
+    """Plays every agent that has not diverged, for the curves."""
     epoch = update // run.settings.bcq.updates_per_epoch
-    for name in trained.well:
+    for name in trained.healthy:
         rows = trained.evaluations[name]
         rows += _play(run, trained.agents[name], trained.agent(name), epoch, update)
         write_rows(run.agent_path(name).with_name("evaluations.csv"), rows)
@@ -155,7 +150,7 @@ def _evaluate_epoch(run: Run, trained: Agents, update: int) -> None:
 
 
 def _play(run: Run, task: str, loss: BCQLoss, epoch: int, update: int) -> list[dict]:
-    """Episodes of an agent; the starts are the same after every epoch."""
+    """Plays episodes of an agent, from the same starts after every epoch."""
     seeds = [run.seed("curve", task, i) for i in range(run.settings.bcq.eval_episodes)]
     policy = BCQPolicy.frozen(loss, num_candidates=run.settings.evaluate.num_candidates).to("cpu")
     return [

@@ -63,7 +63,7 @@ def stage2(run: Run) -> None:
 def value_statistics(
     teachers: list[BCQPolicy], datasets: list[TensorDictBase]
 ) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of each teacher's value on its own data, ``(num_tasks,)``."""
+    """Returns mean and deviation of each teacher's value on its own data, ``(num_tasks,)``."""
     values = [
         teacher.qvalue_network(data.select("observation", "action")).get("state_action_value")
         for teacher, data in zip(teachers, datasets, strict=True)
@@ -72,25 +72,20 @@ def value_statistics(
 
 
 def spread(values: Tensor) -> Tensor:
-    """Standard deviation of a task's numbers ``(N, 1)``; 1 if they are all the same."""
+    """Returns the standard deviation of a task's numbers ``(N, 1)``; 1 if they are equal."""
     deviation = values.std() if len(values) > 1 else torch.zeros_like(values).sum()
     return nonzero_scale(deviation, values.abs().max(), values.dtype)
 
 
 def loss_options(settings: DistillSettings) -> dict[str, Any]:
-    """The settings that are options of the distillation loss."""
+    """Returns the options of the distillation loss in the settings."""
     others = OF_THE_STUDENT + OF_THE_TRAINING
     names = [field.name for field in fields(settings) if field.name not in others]
     return {name: getattr(settings, name) for name in names}
 
 
 def train_student(job: tuple[Run, None], report: Report) -> None:
-    """Trains the student, or resumes from its checkpoint.
-
-    Args:
-        job: the run.
-        report: called with the number of updates done since its last call.
-    """
+    """Trains the student, or resumes from its checkpoint."""
     run, _ = job
     keep_freed_memory()
     settings, distill = run.settings, run.settings.distill
@@ -207,7 +202,7 @@ def train_student(job: tuple[Run, None], report: Report) -> None:
 def proposals(
     student: Student, batch: TensorDictBase, latent_clip: float | None, device: str
 ) -> Tensor:
-    """Candidates of the student, ``(num_tasks, B, candidates, action_dim)``."""
+    """Returns candidates of the student, ``(num_tasks, B, candidates, action_dim)``."""
     data = batch.select("observation").set("task_latent", student.embed(batch))
     data = data.unsqueeze(-1).expand(*data.batch_size, 10)
     on_gpu = torch.device(device).type == "cuda"

@@ -1,4 +1,4 @@
-"""Tasks of a run: registered names, or a YAML file that describes a user's own tasks."""
+"""Builds the tasks of a run from registered names, or from a YAML file of a user's tasks."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _OF_FILES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "parts": (lambda x: isinstance(x, list | tuple) and all(map(_is_text, x)), "a list of names"),
     "title": (_is_text, "a text"),
 }
-"""Keys of a description of files: what their values must be; all but the first may be null."""
+"""Keys of a task's description with their valid values; all but the first may be null."""
 
 
 def read_task_file(path: str | Path) -> dict[str, dict[str, Any]]:
@@ -69,7 +69,7 @@ def read_task_file(path: str | Path) -> dict[str, dict[str, Any]]:
 
 
 def make_tasks(tasks: Sequence[str] | Mapping[str, Mapping[str, Any]]) -> tuple[Task, ...]:
-    """The tasks that settings describe.
+    """Returns the tasks that the settings describe.
 
     Args:
         tasks: names (:func:`~torchrl_bmrl.tasks.get_task`), or descriptions by name as in a
@@ -80,7 +80,7 @@ def make_tasks(tasks: Sequence[str] | Mapping[str, Mapping[str, Any]]) -> tuple[
 
     Raises:
         UnknownNameError: for a name that is not registered.
-        ConfigError: for a description that is not valid, no task at all, or one that comes twice.
+        ConfigError: for an invalid description, no task, or a task that is given twice.
 
     Example:
         >>> [task.title for task in make_tasks(["lift", "push_left"])]
@@ -102,7 +102,7 @@ def make_tasks(tasks: Sequence[str] | Mapping[str, Mapping[str, Any]]) -> tuple[
 
 
 def _make_task(name: str, entry: Mapping[str, Any]) -> Task:
-    """A task of its description: a registered task with other options, or a user's files."""
+    """Builds a task: a registered task with other options, or one of a user's files."""
     if "task" in entry:
         task = get_task(str(entry["task"]))
         options = {key: x for key, x in entry.items() if key not in ("task", "title")}
@@ -125,7 +125,7 @@ def _make_task(name: str, entry: Mapping[str, Any]) -> Task:
         if not missing and (isinstance(value, bool) or not is_valid(value)):
             raise ConfigError(f"task {name}: {key} is {value!r}; valid: {valid}")
     read = entry.get("read") or {}
-    ReadOptions.from_mapping(read)  # refused here and not in the middle of a run
+    ReadOptions.from_mapping(read)  # raises its error now and not in the middle of a run
     parts, env, success = entry.get("parts"), entry.get("env"), entry.get("success")
     files = DemonstrationFiles(
         path=str(entry["demonstrations"]),

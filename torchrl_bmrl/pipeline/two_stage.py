@@ -1,4 +1,4 @@
-"""The whole pipeline, one stage after the other."""
+"""Runs all stages, one after the other."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def two_stage(run: Run) -> str:
         ``seconds.json`` contains the times, summed over all calls.
 
     Raises:
-        BMRLError: of a stage.
+        BMRLError: the errors of the stages.
 
     Example:
         >>> from torchrl_bmrl.pipeline import Settings
@@ -46,7 +46,7 @@ def two_stage(run: Run) -> str:
     for name, stage in STAGES.items():
         started = time.monotonic()
         result = stage(run)
-        # Summed over interruptions, up to the one that was killed.
+        # Summed over all calls; the time of a killed call is lost.
         seconds[name] = round(seconds.get(name, 0.0) + time.monotonic() - started, 1)
         write_atomic(path, json.dumps(seconds, indent=2) + "\n")
         log.debug("%s: done", name)

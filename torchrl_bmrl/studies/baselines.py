@@ -28,7 +28,7 @@ from torchrl_bmrl.evaluation.results import policy_order
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
 from torchrl_bmrl.modules import BCQPolicy, PrototypeTaskLatent
 from torchrl_bmrl.pipeline.agents import make_bcq_loss
-from torchrl_bmrl.pipeline.evaluate import keep_rows
+from torchrl_bmrl.pipeline.evaluate import evaluate_once
 from torchrl_bmrl.pipeline.learners import choose_updates, loss_options
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.stage1 import sizes_of
@@ -277,7 +277,7 @@ def evaluate_job(job: tuple[Run, tuple[str, str]], report: Report) -> list[Resul
             policy = learner.make_policy().to("cpu")
             return run.play(run.task(name), policy, *transforms, seeds=seeds, report=report)
 
-    return keep_rows(run, name, algorithm, play, report=report)
+    return evaluate_once(run, name, algorithm, play, report=report)
 
 
 def make_table(rows: Sequence[ResultRow], updates: int, titles: Mapping[str, str]) -> Table:

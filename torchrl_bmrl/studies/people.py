@@ -20,7 +20,7 @@ from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
 from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.pipeline.collect import collect
-from torchrl_bmrl.pipeline.evaluate import keep_rows
+from torchrl_bmrl.pipeline.evaluate import evaluate_once
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.stage1 import sizes_of, train_agents
 from torchrl_bmrl.reports.page import Section
@@ -160,7 +160,7 @@ def evaluate_job(job: Job, report: Report) -> list[dict[str, Any]]:
             "success": "" if row.success is None else int(row.success),
             "return": row.episode_return,
         }
-        for row in keep_rows(run, task.name, policy, play, report=report)
+        for row in evaluate_once(run, task.name, policy, play, report=report)
     ]
 
 
