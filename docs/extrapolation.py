@@ -52,7 +52,7 @@ from torchrl_bmrl.functional import nonzero_scale
 from torchrl_bmrl.modules import ActionVAE, BCQPolicy, PLASPolicy, make_latent_actor
 from torchrl_bmrl.objectives import BCQLoss, PLASLoss
 from torchrl_bmrl.run.command_line import exit_codes
-from torchrl_bmrl.run.locks import hold_run
+from torchrl_bmrl.run.locks import lock_run
 from torchrl_bmrl.run.workers import Report, available_cores, derive_seed, run_jobs
 from torchrl_bmrl.studies.algorithms import bc, iql, make_actor, make_critics, td3_bc
 from torchrl_bmrl.training.checkpoint import load_checkpoint, save_checkpoint
@@ -335,7 +335,7 @@ def main(words: Sequence[str] | None = None) -> None:
     with exit_codes():
         # More seeds and algorithms may join the finished ones.
         held = {name: getattr(options, name) for name in ("env", *OPTIONS)}
-        with hold_run(Path(options.run_dir), held):
+        with lock_run(Path(options.run_dir), held):
             print(extrapolation(options))
 
 

@@ -124,7 +124,7 @@ def with_folders_settings(config: DictConfig) -> DictConfig:
                 return config
             raise ConfigError(
                 f"{run_dir}: {name} is {mine[name]} here and {theirs.get(name)} in the folder's "
-                "run; give the same settings to go on, or another run_dir"
+                "run; use the same settings to continue, or another run_dir"
             )
     taken = deepcopy(config)
     taken.run_dir = str(run_dir)  # it may refer to a setting that changes

@@ -23,7 +23,7 @@ pytest.importorskip("tqdm")
 from small_runs import Run, contents, tasks, times
 
 from torchrl_bmrl.run import workers
-from torchrl_bmrl.run.locks import hold
+from torchrl_bmrl.run.locks import lock
 from torchrl_bmrl.run.progress import Lines
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
@@ -133,7 +133,7 @@ def test_a_second_run_in_a_folder_is_refused_by_the_owner_and_writes_nothing(
     from torchrl_bmrl.pipeline import two_stage
 
     before = contents(copied, "**/*")
-    with hold(copied):
+    with lock(copied):
         assert ends(run, copied, two_stage) == 1
         assert f"error: {copied}: in use by process {os.getpid()} on " in capsys.readouterr().err
         after = contents(copied, "**/*")
@@ -154,7 +154,7 @@ def test_jobs_of_other_tasks_share_a_folder_and_the_same_task_is_refused(
         settings = configured(*SMALL, f"run_dir={collected}", "workers=1", f"only=[{task}]")
         recipes.run_recipe(settings, stage1, splits=True)
 
-    with hold(collected, ["lift"]):
+    with lock(collected, ["lift"]):
         train("reach")
         with pytest.raises(SystemExit):
             train("lift")

@@ -24,7 +24,7 @@ from small_runs import RECIPES, SMALL, command_line, configured, contents, setti
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.pipeline import Run
 from torchrl_bmrl.run.folder import open_run, read_settings
-from torchrl_bmrl.run.locks import hold, hold_run
+from torchrl_bmrl.run.locks import lock, lock_run
 
 MADE = ("preset=paper", "ablation=dim4", "seed=3", "bcq.lr=1e-4")
 MADE += ("+collect.after.lift=['',reach]", "workers=7", "verbose=true", "device=cuda")
@@ -325,7 +325,7 @@ def test_a_command_that_fails_before_it_did_anything_leaves_nothing(
 
 
 def failing(run_dir: Path, names: Sequence[str] = ("run",), do: Any = lambda: None) -> None:
-    with hold_run(run_dir, {"seed": 0}, names):
+    with lock_run(run_dir, {"seed": 0}, names):
         do()
         raise FileNotFoundError("demonstrations")
 
@@ -358,7 +358,7 @@ def test_a_folder_that_others_hold_a_part_of_stays_theirs(tmp_path: Path) -> Non
     def come() -> None:
         others.__enter__()
 
-    others = hold(folder, ["lift"])
+    others = lock(folder, ["lift"])
     with pytest.raises(FileNotFoundError):
         failing(folder, ["reach"], come)
     assert (folder / "config.yaml").exists()

@@ -17,13 +17,13 @@ pytest.importorskip("filelock")
 pytest.importorskip("yaml")
 
 from torchrl_bmrl.errors import FolderInUseError
-from torchrl_bmrl.run.locks import hold
+from torchrl_bmrl.run.locks import lock
 
 HOLDING = """
 import sys
 from pathlib import Path
-from torchrl_bmrl.run.locks import hold
-with hold(Path(sys.argv[1]), sys.argv[2:]):
+from torchrl_bmrl.run.locks import lock
+with lock(Path(sys.argv[1]), sys.argv[2:]):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -42,11 +42,11 @@ def held(folder: Path, *names: str) -> Iterator[subprocess.Popen[str]]:
 
 def test_a_folder_in_use_is_refused_with_the_owners_process_and_host(tmp_path: Path) -> None:
     with held(tmp_path, "run") as owner:
-        with pytest.raises(FolderInUseError) as caught, hold(tmp_path):
+        with pytest.raises(FolderInUseError) as caught, lock(tmp_path):
             pass
         assert (caught.value.process, caught.value.host) == (str(owner.pid), socket.gethostname())
         assert f"{tmp_path}: in use by process {owner.pid} on" in str(caught.value)
-    with hold(tmp_path):
+    with lock(tmp_path):
         pass
 
 
@@ -54,23 +54,23 @@ def test_what_a_killed_process_held_is_taken_over(tmp_path: Path) -> None:
     with held(tmp_path, "run", "lift") as owner:
         owner.send_signal(signal.SIGKILL)
         owner.wait()
-    with hold(tmp_path, ["lift", "run"]):
+    with lock(tmp_path, ["lift", "run"]):
         said = (tmp_path / ".locks" / "run.json").read_text()
     assert f'"process": {os.getpid()}' in said
 
 
 def test_parts_are_held_each_for_itself_and_none_when_one_is_refused(tmp_path: Path) -> None:
     with held(tmp_path, "lift"):
-        with hold(tmp_path, ["reach"]):
+        with lock(tmp_path, ["reach"]):
             pass
-        with pytest.raises(FolderInUseError), hold(tmp_path, ["a", "lift", "reach"]):
+        with pytest.raises(FolderInUseError), lock(tmp_path, ["a", "lift", "reach"]):
             pass
-        with hold(tmp_path, ["reach", "a"]):  # they were given back
+        with lock(tmp_path, ["reach", "a"]):  # they were given back
             pass
 
 
 def test_a_damaged_note_of_the_owner_still_refuses(tmp_path: Path) -> None:
     with held(tmp_path, "run"):
         (tmp_path / ".locks" / "run.json").write_text("{")
-        with pytest.raises(FolderInUseError, match="process unknown"), hold(tmp_path):
+        with pytest.raises(FolderInUseError, match="process unknown"), lock(tmp_path):
             pass

@@ -278,7 +278,7 @@ def check_sweep_of_three_seeds(cwd: Path, alone: list[dict[str, bytes]], *launch
     names, problem = message.splitlines()
     assert set(REACH) | {"seed=1"} <= set(names.split())
     assert problem.startswith("    error: runs/collect-smoke-seed1: ")
-    assert problem.endswith("give the same settings to go on, or another run_dir")
+    assert problem.endswith("use the same settings to continue, or another run_dir")
     assert "Traceback" not in done.stderr
     assert "Warning" not in done.stderr
     for seed, expected in zip((0, 2), alone, strict=True):

@@ -86,7 +86,7 @@ def test_a_mujoco_that_robosuite_fails_with_is_refused_in_one_line(version: str)
         check_mujoco(good)
     with pytest.raises(MissingExtraError, match=rf"no usable mujoco \({version} is installed"):
         check_mujoco(version)
-    with pytest.raises(MissingExtraError, match="files of it are gone"):
+    with pytest.raises(MissingExtraError, match="files are missing"):
         check_mujoco(None)
 
 

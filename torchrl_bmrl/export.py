@@ -150,8 +150,8 @@ class _Acting(nn.Module):
             generator = policy.generator
             if hasattr(generator, "propose") and not hasattr(generator, "decode"):
                 raise BMRLError(
-                    f"generator {type(generator).__name__} has no 'decode'; valid: one whose "
-                    "actions are a function of a latent, or a decoder"
+                    f"generator {type(generator).__name__} has no 'decode'; valid: one with "
+                    "actions that are a function of a latent, or a decoder"
                 )
             clip = policy.latent_clip
             self.draws = {

@@ -1,8 +1,8 @@
-"""Milliseconds that BCQPolicy takes for the best of 100 candidates, beside plain PyTorch.
+"""Times BCQPolicy's choice among 100 candidates, compared with plain PyTorch.
 
     python tests/benchmarks/acting_speed.py [--rounds 40] [--device cuda]
 
-One state is what an episode asks for, several are episodes side by side. The variants take turns.
+One state is one episode, several states are parallel episodes. The variants run in turn.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CANDIDATES = 100
 
 @torch.no_grad()
 def plain_action(plain: PlainBCQ, observation: Tensor) -> Tensor:
-    """The published way: every state repeated for each of its candidates."""
+    """The published method, which repeats every state for each of its candidates."""
     repeated = observation.repeat_interleave(CANDIDATES, 0)
     shape = (repeated.shape[0], plain.vae.latent_dim)
     latent = torch.randn(shape, device=observation.device).clamp(-0.5, 0.5)
@@ -41,7 +41,7 @@ def plain_action(plain: PlainBCQ, observation: Tensor) -> Tensor:
 
 
 def acting(states: int, device: str = "cpu") -> dict[str, Callable[[], Tensor]]:
-    """The same networks and states, and the action of each way."""
+    """Returns the variants with the same networks and states."""
     plain, loss = make_pair(device=device)
     policy = BCQPolicy.frozen(loss, num_candidates=CANDIDATES)
     observation = torch.randn(states, OBSERVATION_DIM, device=device)
@@ -52,7 +52,7 @@ def acting(states: int, device: str = "cpu") -> dict[str, Callable[[], Tensor]]:
 
 
 def measure(states: int, *, rounds: int, device: str) -> dict[str, float]:
-    """Milliseconds of a call, the median over the rounds."""
+    """Returns the median milliseconds of a call."""
     ways = acting(states, device)
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     for number in range(rounds + 3):

@@ -1,15 +1,15 @@
-"""Updates per second of BCQ: this library, plain PyTorch, d3rlpy, and the products alone.
+"""Updates per second of BCQ in this library, plain PyTorch and d3rlpy, and of its matrix products.
 
     python tests/benchmarks/bcq_speed.py [--rounds 40] [--batch-sizes 100 256] [--members 6]
     python tests/benchmarks/bcq_speed.py --device cuda --members 1 2 4 6 8 16 32 64
 
-An update is what one step of training does, without the sampling of its batch: VAE step, critic
-step, soft update of the targets; of a stack it counts once per member. The variants take turns in
-one process; each round gives one ratio to plain PyTorch and one to the limit, the table their
-medians, so that what else the machine does matters little.
+An update is one training step without sampling its batch: VAE step, critic step, soft update of the
+targets. An update of a stack counts once per member. The variants run in turn in one process. Each
+round gives a ratio to plain PyTorch and one to the limit; the table contains medians, so that other
+load on the machine has little influence.
 
-The limit is the time that the update's matrix products take by themselves, into memory that is
-there already: forward, gradients, and next actions whose states' part is computed once.
+The limit is the time of the update's matrix products alone, into allocated memory: forward,
+gradients, and next actions with the states' part computed once.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def copy_weights(source: nn.Module, destination: nn.Module) -> None:
 def make_pair(
     seed: int = 0, *, device: str = "cpu", perturbation: bool = False, **options: Any
 ) -> tuple[PlainBCQ, BCQLoss]:
-    """Both with the same weights, targets included."""
+    """Returns both variants with the same weights, including the targets."""
     torch.manual_seed(seed)
     generator = ActionVAE(OBSERVATION_DIM, ACTION_DIM)
     critics = [make_qvalue_network(OBSERVATION_DIM, ACTION_DIM) for _ in range(2)]
@@ -109,7 +109,7 @@ def make_plain_update(device: str = "cpu", compiled: bool = False) -> Update:
 
 
 def make_library_update(loss: LossModule, **options: Any) -> Update:
-    """One update as ``recipes/train_bcq.py`` does it; ``options`` are of ``accelerate``."""
+    """Returns the update of ``recipes/train_bcq.py``; ``options`` are those of ``accelerate``."""
     targets = SoftUpdate(loss, tau=TAU)
     names = [name for name in NETWORKS if getattr(loss, f"{name}_params", None) is not None]
     optimizers = {
@@ -137,7 +137,7 @@ def make_alone(device: str = "cpu", accelerated: str = "", **options: Any) -> Up
 
 
 def make_stack(members: int, device: str = "cpu", accelerated: str = "") -> Update:
-    """One update of every member, all on the same batch."""
+    """Returns an update of every member, all on the same batch."""
     stack = StackedLoss([make_pair(seed)[1] for seed in range(members)]).to(device)
     options = dict.fromkeys(accelerated.split(), True)
     update = make_library_update(stack, device=device, **options)
@@ -145,7 +145,7 @@ def make_stack(members: int, device: str = "cpu", accelerated: str = "") -> Upda
 
 
 def make_products(rows: int, device: str = "cpu", num_candidates: int = 10) -> Update:
-    """The matrix products of one update and nothing else."""
+    """Returns the matrix products of one update."""
     state, action, latent = OBSERVATION_DIM, ACTION_DIM, 2 * ACTION_DIM
     shapes = []  # rows of the left matrix, columns of it, columns of the right one
 
@@ -180,7 +180,7 @@ def make_products(rows: int, device: str = "cpu", num_candidates: int = 10) -> U
 
 
 class Outside:
-    """d3rlpy's updates, done and timed by another process; see ``d3rlpy_bcq.py``."""
+    """d3rlpy's updates, timed in another process; see ``d3rlpy_bcq.py``."""
 
     def __init__(self, python: str, rows: int) -> None:
         script = Path(__file__).with_name("d3rlpy_bcq.py")
@@ -204,7 +204,7 @@ class Outside:
 
 
 def variants(rows: int, device: str, members: list[int]) -> dict[str, tuple[Update, int]]:
-    """By name, an update and for how many members it counts."""
+    """Returns updates by name, each with its number of members."""
     made: dict[str, tuple[Update, int]] = {
         LIMIT: (make_products(rows, device), 1),
         PLAIN: (make_plain_update(device), 1),
@@ -226,7 +226,7 @@ def variants(rows: int, device: str, members: list[int]) -> dict[str, tuple[Upda
 
 
 def warmed_up(update: Update, batches: list[TensorDict]) -> Update:
-    """The update after its compilation and the optimizers' first steps."""
+    """Returns the update after its compilation and the optimizers' first steps."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what the compiler says about tensordict's internals
         for _, batch in zip(range(max(WARM_UP, len(batches))), cycle(batches), strict=False):
@@ -237,7 +237,7 @@ def warmed_up(update: Update, batches: list[TensorDict]) -> Update:
 def measure(
     rows: int, *, rounds: int, updates: int, device: str, members: list[int], d3rlpy: str | None
 ) -> dict[str, tuple[float, float, float]]:
-    """Medians over the rounds: updates per second, ratio to plain, share of the limit."""
+    """Returns medians over the rounds: updates per second, ratio to plain, share of the limit."""
     batches = [make_batch(rows, seed).to(device) for seed in range(4)]
     torch.compiler.reset()
     made = variants(rows, device, members)
@@ -276,7 +276,7 @@ def wait(device: str) -> None:
 
 
 def product_speed(device: str) -> float:
-    """GFLOP/s of a layer over 1000 candidates, the best of several runs."""
+    """Returns the best GFLOP/s of a layer over 1000 candidates."""
     left = torch.randn(1000, WIDTH, device=device)
     right = torch.randn(WIDTH, WIDTH, device=device)
     seconds = []
@@ -295,7 +295,7 @@ def read_options(
     arguments: list[str] | None,
     options: dict[str, dict[str, Any]] | None = None,
 ) -> argparse.Namespace:
-    """Options of a script, with those that all have."""
+    """Parses the options of a script and those that all scripts have."""
     parser = argparse.ArgumentParser(description=(summary or "").splitlines()[0])
     parser.add_argument("--rounds", type=int, default=40)
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")

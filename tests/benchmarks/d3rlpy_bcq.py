@@ -1,11 +1,11 @@
-"""d3rlpy's BCQ, timed from outside: bcq_speed.py starts this with the Python that has d3rlpy.
+"""Runs d3rlpy's BCQ for bcq_speed.py, with a Python that has d3rlpy.
 
-It pins versions of gymnasium that others here do not take, so it has an environment of its own:
+d3rlpy needs another version of gymnasium than this library, and so a separate environment:
 
     python -m venv /tmp/d3 && /tmp/d3/bin/pip install torch==2.13.0 d3rlpy==2.8.1
     python tests/benchmarks/bcq_speed.py --d3rlpy /tmp/d3/bin/python
 
-Reads a number of updates per line, does them and answers with the seconds that they took.
+Reads a number of updates per line, runs them and prints the seconds that they took.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
     python tests/benchmarks/data_loading.py                  # 1,400 episodes of 200 steps
     python tests/benchmarks/data_loading.py --share 0.1
 
-Files of random numbers in the layout of recipes/collect.py are written first. Then a fresh process
-converts them, another loads them again, and both say what they needed.
+First it writes files of random numbers in the layout of recipes/collect.py. Then one new process
+converts them and another loads them; both print time and memory.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ SIZES = {
 
 
 def random_episode(rng: np.random.Generator) -> Episode:
-    """An episode as large as a collected one, model and states included."""
+    """Returns an episode as large as a recorded one, including model and states."""
     parts = {name: rng.standard_normal((HORIZON + 1, size)) for name, size in SIZES.items()}
     return Episode(
         observations={name: part[:-1] for name, part in parts.items()},
@@ -63,7 +63,7 @@ def random_episode(rng: np.random.Generator) -> Episode:
 
 
 def write(folder: Path, share: float) -> float:
-    """Files of all tasks; the seconds that took."""
+    """Writes files of all tasks; returns the seconds."""
     start = time.perf_counter()
     rng = np.random.default_rng(0)
     for task, episodes in PAPER.items():
@@ -85,7 +85,7 @@ def timed(name: str, seconds: dict[str, float]) -> Iterator[None]:
 
 
 def load(folder: Path, batch_size: int) -> tuple[dict[str, float], int, float, float]:
-    """Seconds by stage, transitions, milliseconds a sample, peak memory [GB]."""
+    """Returns seconds by stage, transitions, milliseconds per sample, peak memory [GB]."""
     torch.set_num_threads(1)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     seconds: dict[str, float] = {}

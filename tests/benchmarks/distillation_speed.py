@@ -1,8 +1,8 @@
-"""Updates per second of stage 2: teachers one after the other or stacked, eager or compiled.
+"""Updates per second of stage 2, with teachers in a loop or stacked, eager or compiled.
 
     python tests/benchmarks/distillation_speed.py [--rounds 40] [--device cuda]
 
-Six teachers, 64 transitions of each task, the recipe's loss. Without the sampling of the batch.
+Six teachers, 64 transitions of each task, the recipe's loss, without sampling the batch.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ TASKS, ROWS = 6, 64
 
 
 def make_data(device: str = "cpu") -> TensorDict:
-    """Random transitions of every task."""
+    """Returns random transitions of every task."""
     data = torch.stack([make_batch(ROWS, seed) for seed in range(TASKS)])
     data["task"] = torch.arange(TASKS).unsqueeze(-1).expand(TASKS, ROWS).clone()
     return data.to(device)
@@ -37,7 +37,7 @@ def make_data(device: str = "cpu") -> TensorDict:
 def make_update(
     device: str = "cpu", *, in_sequence: bool = False, optimizer: str = "step", **options: Any
 ) -> Callable[[TensorDict], Any]:
-    """One update; ``optimizer`` is ``"step"`` as in the recipe or PyTorch's own ``"backward"``."""
+    """Returns an update; ``optimizer`` is the recipe's ``"step"`` or PyTorch's ``"backward"``."""
     torch.manual_seed(0)
     losses = [make_bcq_loss(observation_dim=OBSERVATION_DIM, action_dim=ACTION_DIM)] * TASKS
     teachers = [BCQPolicy.frozen(loss) for loss in losses]
@@ -61,7 +61,7 @@ def make_update(
 
 
 def variants(device: str) -> dict[str, Callable[[TensorDict], Any]]:
-    """By name, an update."""
+    """Returns updates by name."""
     made = {
         "teachers in sequence, torch.optim": make_update(
             device, in_sequence=True, optimizer="backward"

@@ -1,10 +1,10 @@
-"""Milliseconds for the best of 100 candidates in one state, of policies that left the library.
+"""Times exported policies' choice among 100 candidates in one state.
 
     python tests/benchmarks/export_speed.py [--rounds 40] [--inductor]
 
-The same policy as it is, as a program of torch.export, compiled by AOTInductor, and as an ONNX
-file, executed by ONNX Runtime. All draw their latents, the file's caller with numpy. One core; the
-ways take turns, ten calls each after a first one, which is counted apart.
+The variants are the policy itself, a torch.export program, the program compiled by AOTInductor, and
+an ONNX file in ONNX Runtime. All include drawing the latents, for the ONNX file with numpy. They
+run in turn on one core, ten calls each after a first call, which is reported separately.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ CANDIDATES = 100
 
 
 def policies() -> dict[str, BCQPolicy]:
-    """An agent, one with a perturbation network, and a student of six tasks."""
+    """Returns an agent, one with a perturbation network, and a student of six tasks."""
     torch.manual_seed(0)
     student = Student(num_tasks=6)
     return {
@@ -49,14 +49,14 @@ def policies() -> dict[str, BCQPolicy]:
 
 
 def session_of(path: Path) -> onnxruntime.InferenceSession:
-    """An ONNX file on one thread."""
+    """Returns a session of an ONNX file on one thread."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
 
 
 def acting(policy: BCQPolicy, folder: Path, *, inductor: bool) -> dict[str, Callable[[], Any]]:
-    """The action in one state, of each way."""
+    """Returns a function for each variant that computes the action in one state."""
     sizes = {"observation": OBSERVATION_DIM, "task_latent": 2}
     state = {key: torch.randn(1, sizes[key]) for key in policy.in_keys}
     program = torch.export.export(policy, args=(), kwargs=state)
@@ -84,7 +84,7 @@ def acting(policy: BCQPolicy, folder: Path, *, inductor: bool) -> dict[str, Call
 
 
 def measure(ways: dict[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
-    """Milliseconds of a call and ratio to the first way's, then both for each turn's first call."""
+    """Returns milliseconds of a call and ratio to the first variant, also for the first calls."""
     seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
     for number in range(rounds + 3):
         for name, act in ways.items():

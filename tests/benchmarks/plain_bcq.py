@@ -1,8 +1,7 @@
-"""Batch-Constrained Q-learning in plain PyTorch, in the published order: what BCQLoss is timed by.
+"""Batch-Constrained Q-learning in plain PyTorch, to which BCQLoss is compared.
 
 Fujimoto et al. 2019, https://arxiv.org/abs/1812.02900, algorithm 1, without the perturbation
-network: modules, optimizers and tensors, nothing of tensordict or TorchRL. The networks are those
-of ``torchrl_bmrl.modules``.
+network and without tensordict or TorchRL. The networks equal those of ``torchrl_bmrl.modules``.
 """
 
 from __future__ import annotations

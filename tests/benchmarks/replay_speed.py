@@ -1,10 +1,10 @@
-"""Time to sample a batch beside the time of the update that it is for.
+"""Time to sample a batch, compared with the time of the update.
 
     python tests/benchmarks/replay_speed.py [--rows 46000] [--tasks 6] [--batch 256] [--seconds 10]
 
-Stage 1 samples one task's transitions for BCQLoss, stage 2 all tasks' for MetaDistillationLoss,
-both as they are by default. The parts take turns on one thread, so that each finds the memory
-caches as the others leave them; the table holds medians.
+Stage 1 samples one task's transitions for BCQLoss, stage 2 those of all tasks for
+MetaDistillationLoss, both with default options. The parts run in turn on one thread, so that the
+caches are in the same state as in training. The table contains medians.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Update = Callable[[TensorDict], Any]
 
 
 def make_data(rows: int, task: int) -> TensorDict:
-    """Random transitions with the keys that demonstrations have."""
+    """Returns random transitions with the keys of demonstrations."""
     data, number = make_batch(rows, seed=task), torch.arange(rows)
     flags = {name: torch.zeros(rows, 1, dtype=torch.bool) for name in ("truncated", "success")}
     data["next"].update(flags)
@@ -46,7 +46,7 @@ def make_data(rows: int, task: int) -> TensorDict:
 
 
 def make_distillation_update(num_tasks: int) -> Update:
-    """One update as ``recipes/distill.py`` does it, with untrained teachers."""
+    """Returns the update of ``recipes/distill.py`` with untrained teachers."""
     teachers = [BCQPolicy.frozen(make_pair(seed)[1]) for seed in range(num_tasks)]
     dims = {"observation_dim": OBSERVATION_DIM, "action_dim": ACTION_DIM}
     student = Student(num_tasks=num_tasks, latent_dim=teachers[0].latent_dim, **dims)
@@ -81,7 +81,7 @@ def timed(times: list[float]) -> Iterator[None]:
 def measure(
     stages: dict[str, tuple[Callable[[], TensorDict], Update]], seconds: float
 ) -> dict[str, tuple[float, float]]:
-    """Median seconds of a sample and of an update, by stage."""
+    """Returns median seconds of a sample and of an update, by stage."""
     times: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in stages}
     for sample, update in stages.values():
         for _ in range(WARM_UP):

@@ -1,4 +1,4 @@
-"""robosuite's own step beside the fast one: speed, workers, memory, policies in a batch.
+"""Compares robosuite's own step with the fast one: speed, workers, memory, batched policies.
 
     python tests/benchmarks/simulator_speed.py [--rounds 5] [--episodes 60]
 
@@ -52,7 +52,7 @@ ARMS = ("Panda", "Sawyer", "UR5e")
 
 
 def seconds(call: Callable[[], object]) -> float:
-    """Time of one call."""
+    """Returns the time of one call."""
     start = perf_counter()
     call()
     return perf_counter() - start
@@ -86,7 +86,7 @@ def stock_table(rounds: int, steps: int = 25) -> None:
 
 
 def stock_environment(task: str, arm: str) -> Any:
-    """robosuite's environment without pictures, otherwise with its defaults and shaped rewards."""
+    """Returns robosuite's environment without pictures, with its defaults and shaped rewards."""
     env = robosuite.make(
         task, robots=arm, use_camera_obs=False, has_offscreen_renderer=False, reward_shaping=True,
         ignore_done=True, hard_reset=False, seed=0,
@@ -96,7 +96,7 @@ def stock_environment(task: str, arm: str) -> Any:
 
 
 class Played(NamedTuple):
-    """Three episodes: each step's time and start, and everything that came out of them."""
+    """Three episodes: each step's time and initial state, and all results."""
 
     times: np.ndarray
     states: list[np.ndarray]
@@ -132,7 +132,7 @@ def play_stock(env: Any, steps: int) -> Played:
 
 
 def episode(env: TabletopEnv, steps: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Actions of a noisy expert, and the states in which they were taken."""
+    """Returns actions of a noisy expert and the states before them."""
     env.reset(seed=0)
     expert, rng = make_expert(env.robosuite_env), np.random.default_rng(0)
     actions, states = [], []
@@ -144,13 +144,13 @@ def episode(env: TabletopEnv, steps: int) -> tuple[list[np.ndarray], list[np.nda
 
 
 def play(env: TabletopEnv, actions: list[np.ndarray]) -> float:
-    """Time of an episode's steps."""
+    """Returns the time of an episode's steps."""
     env.reset(seed=0)
     return sum(seconds(lambda: env.step(action)) for action in actions)  # noqa: B023
 
 
 def bare(env: Any, states: list[np.ndarray]) -> list[float]:
-    """Times of robosuite's physics alone from the same states."""
+    """Returns the times of robosuite's physics alone, from the same states."""
     model, data = env.sim.model._model, env.sim.data._data
     substeps, times = int(0.05 / model.opt.timestep), []
 
@@ -166,7 +166,7 @@ def bare(env: Any, states: list[np.ndarray]) -> list[float]:
 
 
 def step_table(rounds: int, steps: int = 200) -> None:
-    """Control steps per second of one process, per task."""
+    """Prints control steps per second of one process, per task."""
     print("\n| Task | robosuite | fast | bare, robosuite's model | bare, lean | fast / robosuite |"
           " fast / bare (robosuite's, lean) |\n|---|---:|---:|---:|---:|---:|---:|")  # fmt: skip
     for task in SKILLS:
@@ -190,7 +190,7 @@ def step_table(rounds: int, steps: int = 200) -> None:
 
 
 def worker_table(episodes: int) -> None:
-    """Time of a collection, start of the processes included."""
+    """Prints the time of a collection, including the start of the processes."""
     print("\n| Stepper | workers | episodes | seconds | episodes / s |\n|---|---:|---:|---:|---:|")
     for stepper in STEPPERS:
         for workers in (1, 2):
@@ -212,7 +212,7 @@ def worker_table(episodes: int) -> None:
 
 
 def policy_table(steps: int = 50) -> None:
-    """Time of a step of one episode, a policy of 100 candidates included."""
+    """Prints the time of a step of one episode, including a policy with 100 candidates."""
     policy = BCQPolicy.frozen(make_bcq_loss(observation_dim=33, action_dim=7))
     print("\n| Stepper | episodes side by side | ms per step of an episode |\n|---|---:|---:|")
     for stepper in STEPPERS:
@@ -255,7 +255,7 @@ print(f"{before:.0f} | {resident():.0f}")
 
 
 def memory_table() -> None:
-    """Resident memory of a process with environments that have acted, and of one that collects."""
+    """Prints the memory of a process after steps of environments, and of one that collects."""
     print("\n| Stepper | process | MB of imports | MB in all |\n|---|---|---:|---:|")
     for stepper in STEPPERS:
         for name, *arguments in (

@@ -1,7 +1,7 @@
-"""The plain update equals the library's; how many of each run per second.
+"""Checks that the plain update equals the library's, and times both.
 
-pytest tests/benchmarks                         # the check and the timings
-pytest tests/benchmarks --benchmark-disable     # the check, and one run of each
+pytest tests/benchmarks                         # checks and timings
+pytest tests/benchmarks --benchmark-disable     # checks, and one run of each update
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ def check_mujoco(version: str | None) -> None:
         4.0.0 is installed; robosuite works below 3.10
     """
     if version is None:
-        reason = "files of it are gone; pip install --force-reinstall 'mujoco<3.10' brings them"
+        reason = "files are missing; pip install --force-reinstall 'mujoco<3.10' restores them"
     elif tuple(map(int, version.split(".")[:2])) >= BELOW:
         reason = f"{version} is installed; robosuite works below {'.'.join(map(str, BELOW))}"
     else:

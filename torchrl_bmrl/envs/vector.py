@@ -33,7 +33,7 @@ class TabletopVectorEnv(VectorEnv):
         **kwargs: other arguments of ``TabletopEnv``.
 
     Raises:
-        BMRLError: for less than one environment, and for what ``TabletopEnv`` refuses.
+        BMRLError: for ``num_envs`` below one, and the errors of ``TabletopEnv``.
 
     Example:
         >>> env = TabletopVectorEnv("push_up", num_envs=3)

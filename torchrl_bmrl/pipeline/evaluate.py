@@ -257,9 +257,12 @@ def run_facts(run: Run) -> dict[str, str]:
     """Facts about the run for the report."""
     settings = run.settings
     versions = read_versions(run.folder)
-    said = {"Versions": ", ".join(f"{name} {version}" for name, version in versions.items())}
+    used = {"Versions": ", ".join(f"{name} {version}" for name, version in versions.items())}
     if settings.evaluate.policy:
-        return {"Policy": settings.evaluate.policy, "Seed of the starts": str(settings.seed)} | said
+        return {
+            "Policy": settings.evaluate.policy,
+            "Seed of the starts": str(settings.seed),
+        } | used
     counts = settings.collect.train_episodes
     recorded = ", ".join(f"{name} {count}" for name, count in counts.items())
     sources = [f"{recorded}; {settings.collect.valid_episodes} held out of each"] if counts else []
@@ -271,4 +274,4 @@ def run_facts(run: Run) -> dict[str, str]:
         "Demonstrations": "; ".join(sources),
         "Stage 1": f"{settings.bcq.epochs} epochs of {settings.bcq.updates_per_epoch} updates",
         "Stage 2": f"{settings.distill.updates} updates",
-    } | said
+    } | used

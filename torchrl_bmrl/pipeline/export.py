@@ -26,7 +26,7 @@ CARD = """# The distilled policy of preset {preset}, seed {seed}
 
 One policy for {number} tasks ({tasks}), conditioned on a task embedding m of {dim} numbers.
 {parameters:,} parameters: the encoder of m, its classifier, the generator of actions and the critic
-that chooses among them. The file also holds a point of m for each task, the statistics that
+that chooses among them. The file also contains a point of m for each task, the statistics that
 normalise observations, and one held-out demonstration of each task.
 
 ```bash

@@ -147,7 +147,7 @@ class Agents:
     ) -> dict[str, dict[str, float]]:
         """Returns the metrics of every agent that has not diverged.
 
-        An agent that diverges is not saved any more.
+        An agent that has diverged is no longer saved.
 
         Raises:
             BMRLError: if all agents have diverged.
@@ -183,16 +183,16 @@ class Agents:
 
     def load(self) -> None:
         """Loads the last checkpoint, if there is one."""
-        kept = resume_training(
+        saved = resume_training(
             self.path, self.loss, self.optimizers, kind=self.kind, device=self.device
         )
-        if kept is None:
+        if saved is None:
             return
-        self.updates = kept["updates"]
+        self.updates = saved["updates"]
         if self.kind == "bcq":
-            self.evaluations = {self.names[0]: kept["evaluations"]}
+            self.evaluations = {self.names[0]: saved["evaluations"]}
             return
-        self.evaluations, self.diverged = kept["evaluations"], kept["diverged"]
+        self.evaluations, self.diverged = saved["evaluations"], saved["diverged"]
         for name in self.healthy:
             path = self.run.agent_path(name)
             if not path.exists() or load_checkpoint(path, kind="bcq")[1]["updates"] != self.updates:

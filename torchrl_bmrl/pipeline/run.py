@@ -29,7 +29,7 @@ from torchrl_bmrl.objectives import BCQLoss
 from torchrl_bmrl.pipeline.agents import Student, load_bcq_loss, load_student
 from torchrl_bmrl.pipeline.settings import SIX_TASKS, Settings
 from torchrl_bmrl.pipeline.task_files import make_tasks, read_task_file
-from torchrl_bmrl.run.locks import hold_run
+from torchrl_bmrl.run.locks import lock_run
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
 from torchrl_bmrl.tasks import Task, compose_tasks, get_task
 
@@ -87,7 +87,7 @@ class Run:
         # Jobs that train only some tasks lock these, so that other jobs can train the rest.
         parts = self.settings.only or ["run", *self.names]
         opened = ExitStack()
-        opened.enter_context(hold_run(self.folder, asdict(self.settings), parts))
+        opened.enter_context(lock_run(self.folder, asdict(self.settings), parts))
         self._opened = opened
         gc.freeze()  # robosuite collects garbage at every env.close(): leave imported modules out
         return self

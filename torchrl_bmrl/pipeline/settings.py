@@ -167,7 +167,7 @@ class Settings:
             device: whether ``device`` must exist on this machine.
 
         Raises:
-            BMRLError: naming the setting, its value and what is valid.
+            BMRLError: naming the setting, its value and the valid values.
         """
         check_settings(self)
         check_value_bounds(self.bcq.value_bounds)

@@ -119,10 +119,10 @@ def train_student(job: tuple[Run, None], report: Report) -> None:
     ).to(settings.device)
     optimizer = make_adam(loss.parameters(), lr=distill.lr)
     path = run.folder / "distill" / "checkpoint.safetensors"
-    kept = resume_training(
+    saved = resume_training(
         path, student, {"student": optimizer}, kind="student", device=settings.device
     )
-    done = kept["updates"] if kept else 0
+    done = saved["updates"] if saved else 0
     if done:
         log.debug("distillation: resumed from update %d", done)
         report(done)

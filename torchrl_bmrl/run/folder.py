@@ -107,7 +107,7 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
         if before.get(key) != now.get(key):
             raise ConfigError(
                 f"{run_dir}: {key} is {now.get(key)} here and {before.get(key)} in the folder's "
-                "run; give the same settings to go on, or another run_dir"
+                "run; use the same settings to continue, or another run_dir"
             )
 
 

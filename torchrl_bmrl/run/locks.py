@@ -20,7 +20,7 @@ with needs("recipes"):
 
 
 @contextlib.contextmanager
-def hold(folder: Path, names: Sequence[str] = ("run",)) -> Iterator[None]:
+def lock(folder: Path, names: Sequence[str] = ("run",)) -> Iterator[None]:
     """Locks a folder, or named parts of it, for this process.
 
     The operating system releases the locks of a process when it ends, also when it is killed. The
@@ -37,9 +37,9 @@ def hold(folder: Path, names: Sequence[str] = ("run",)) -> Iterator[None]:
     Example:
         >>> import tempfile
         >>> folder = Path(tempfile.mkdtemp())
-        >>> with hold(folder, ["reach"]), hold(folder, ["lift"]):
+        >>> with lock(folder, ["reach"]), lock(folder, ["lift"]):
         ...     pass
-        >>> with hold(folder), hold(folder):
+        >>> with lock(folder), lock(folder):
         ...     pass
         Traceback (most recent call last):
         ...
@@ -61,10 +61,10 @@ def hold(folder: Path, names: Sequence[str] = ("run",)) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def hold_run(
+def lock_run(
     run_dir: Path, settings: Mapping[str, Any], names: Sequence[str] = ("run",)
 ) -> Iterator[None]:
-    """Locks a run folder (:func:`hold`) and opens it (:func:`~torchrl_bmrl.run.folder.open_run`).
+    """Locks a run folder (:func:`lock`) and opens it (:func:`~torchrl_bmrl.run.folder.open_run`).
 
     If the block raises before it wrote any file, the files and folders that this function created
     are removed.
@@ -75,13 +75,13 @@ def hold_run(
         names: names of the parts to lock.
 
     Raises:
-        BMRLError: the errors of ``hold`` and ``open_run``.
+        BMRLError: the errors of ``lock`` and ``open_run``.
 
     Example:
         >>> import tempfile
         >>> folder = Path(tempfile.mkdtemp()) / "runs" / "mine"
         >>> try:
-        ...     with hold_run(folder, {"seed": 0}):
+        ...     with lock_run(folder, {"seed": 0}):
         ...         raise FileNotFoundError("demonstrations")
         ... except FileNotFoundError:
         ...     folder.parent.exists()
@@ -89,7 +89,7 @@ def hold_run(
     """
     before = set(run_dir.rglob("*"))
     missing = [folder for folder in (run_dir, *run_dir.parents) if not folder.exists()]
-    with hold(run_dir, names):
+    with lock(run_dir, names):
         try:
             open_run(run_dir, settings)
             yield

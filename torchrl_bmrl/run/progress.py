@@ -26,11 +26,11 @@ WINDOW = 6
 _prefix = ""
 
 
-def name_lines(whose: str) -> None:
+def name_lines(prefix: str) -> None:
     """Sets a prefix for all progress lines of this process: several runs may share a log.
 
     Args:
-        whose: the prefix; ``""`` for none.
+        prefix: the prefix without its colon; ``""`` for none.
 
     Example:
         >>> name_lines("runs/mine")
@@ -39,7 +39,7 @@ def name_lines(whose: str) -> None:
         >>> name_lines("")
     """
     global _prefix
-    _prefix = f"{whose}: " if whose else ""
+    _prefix = f"{prefix}: " if prefix else ""
 
 
 class Progress(Protocol):

@@ -188,14 +188,14 @@ class Learner:
 
     def load(self) -> None:
         """Loads the last checkpoint, if there is one."""
-        kept = resume_training(
+        saved = resume_training(
             self.path,
             self.loss,
             self.optimizers,
             kind="baseline",
             device=self.run.settings.device,
         )
-        self.updates = kept["updates"] if kept else 0
+        self.updates = saved["updates"] if saved else 0
 
     def save(self, update: int) -> None:
         """Saves what training resumes from."""

@@ -26,7 +26,7 @@ from torchrl_bmrl.pipeline.stage1 import sizes_of, train_agents
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
 from torchrl_bmrl.reports.tables import MISSING, Table
-from torchrl_bmrl.run.locks import hold_run
+from torchrl_bmrl.run.locks import lock_run
 from torchrl_bmrl.run.progress import progress
 from torchrl_bmrl.run.settings import setting
 from torchrl_bmrl.run.workers import Report
@@ -81,7 +81,7 @@ def learn_from_people(run: Run, settings: HumanSettings) -> str:
     alone.check_playable()
     # More shares and seeds may join the finished ones, with the same demonstrations.
     held = {name: getattr(settings, name) for name in ("path", "task", "tracking")}
-    with hold_run(folder, held):
+    with lock_run(folder, held):
         _convert(settings, folder / "demonstrations.hdf5")
         with alone:
             collect(alone)
