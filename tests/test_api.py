@@ -31,8 +31,8 @@ PAGES += sorted((ROOT / "docs").glob("*.md"))
 GUIDES = "".join(page.read_text() for page in PAGES)
 REFERENCES = sorted(set(re.findall(r"\btorchrl_bmrl(?:\.\w+)+", GUIDES)))
 """Dotted names in the guides."""
-TORCHRL = re.compile(r"tensordict|\w+_spec")
-"""Parameters of methods that TorchRL calls; the class says what lies in them."""
+TORCHRL = re.compile(r"tensordict|\w+_spec|xml_str")
+"""Parameters of methods that TorchRL or robosuite calls; the class says what lies in them."""
 
 each_module = pytest.mark.parametrize("name", sorted(LISTED))
 

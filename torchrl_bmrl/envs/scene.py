@@ -158,11 +158,7 @@ class TabletopScene(ManipulationEnv):
         )
 
     def edit_model_xml(self, xml_str: str) -> str:
-        """Applies robosuite's changes, and removes what only cameras see if ``lean`` is set.
-
-        Args:
-            xml_str: MJCF of the scene.
-        """
+        """Applies robosuite's changes, and removes what only cameras see if ``lean`` is set."""
         self._scene = super().edit_model_xml(xml_str)
         return without_pictures(self._scene) if self.lean else self._scene
 
