@@ -21,7 +21,7 @@ from torchrl_bmrl.data.robomimic import open_episodes, read_kept_episode
 from torchrl_bmrl.envs.skills import SKILLS
 from torchrl_bmrl.errors import ConfigError, DataError, UnknownNameError
 from torchrl_bmrl.experts import collect
-from torchrl_bmrl.experts.collect import EpisodeJob, collect_demonstrations
+from torchrl_bmrl.experts.collect import _EpisodeJob, collect_demonstrations
 from torchrl_bmrl.experts.controllers import EXPERTS
 from torchrl_bmrl.experts.tabletop import make_task
 from torchrl_bmrl.run.workers import Report
@@ -209,7 +209,7 @@ def test_what_was_finished_before_a_kill_is_kept_and_not_redone(
 ) -> None:
     real, calls = collect._collect_job, []
 
-    def killed_at_the_fourth(job: EpisodeJob, report: Report) -> None:
+    def killed_at_the_fourth(job: _EpisodeJob, report: Report) -> None:
         if len(calls) == 3:
             raise Killed
         calls.append((job.task.name, job.seed))
@@ -227,7 +227,7 @@ def test_what_was_finished_before_a_kill_is_kept_and_not_redone(
 
     redone = []
 
-    def counted(job: EpisodeJob, report: Report) -> None:
+    def counted(job: _EpisodeJob, report: Report) -> None:
         assert times == {name: (tmp_path / name).stat().st_mtime_ns for name in kept}
         redone.append((job.task.name, job.seed))
         real(job, report)

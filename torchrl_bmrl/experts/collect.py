@@ -19,37 +19,20 @@ from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
 from torchrl_bmrl.tasks import Task, get_task
 
-ENV_ARGS = "env_args"
-"""Attribute of a recorded episode that becomes robomimic's ``env_args`` of the file."""
-
 
 @dataclass(frozen=True, kw_only=True)
-class EpisodeJob:
-    """One episode to record.
-
-    Attributes:
-        task: the task.
-        seed: seed of start and noise.
-        noise: standard deviation of the Gaussian noise on each action dimension.
-        path: file of the episode.
-        gains: gains of the expert; ``None`` for the defaults.
-        after: tasks whose experts act before the episode begins.
-
-    Example:
-        >>> job = EpisodeJob(task=get_task("lift"), seed=0, noise=0.2, path=Path("00000.npz"))
-        >>> job.task.options["stepper"]
-        'fast'
-    """
+class _EpisodeJob:
+    """One episode to record into a file."""
 
     task: Task
     seed: int
     noise: float
     path: Path
-    gains: Any = None
-    after: tuple[Task, ...] = ()
+    gains: Any
+    after: tuple[Task, ...]
 
 
-def _collect_job(job: EpisodeJob, report: Report) -> None:
+def _collect_job(job: _EpisodeJob, report: Report) -> None:
     assert job.task.record is not None
     episode = job.task.record(
         job.seed, noise=job.noise, gains=job.gains, after=job.after, **job.task.options
@@ -126,7 +109,7 @@ def collect_demonstrations(
         if not path.exists()
     }
     jobs = [
-        EpisodeJob(
+        _EpisodeJob(
             task=by_name[name],
             seed=derive_seed(seed, "collect", name, i),
             noise=noise,
@@ -158,7 +141,7 @@ def collect_demonstrations(
                 "train": range(episodes[name]),
                 "valid": range(episodes[name], counts[name]),
             },
-            env_args=first.attributes.get(ENV_ARGS, {}),
+            env_args=first.attributes.get("env_args", {}),
             attributes={"task": name, "action_noise": noise, "seed": seed},
         )
         # The whole folder: a killed process may have left temporary files in it.
@@ -180,5 +163,6 @@ def _parse_after(entry: str, by_name: Mapping[str, Task]) -> tuple[Task, ...]:
 
 
 def _without_env_args(episode: Episode) -> Episode:
-    attributes = {key: value for key, value in episode.attributes.items() if key != ENV_ARGS}
+    """Drops the attribute that is stored once for the whole file."""
+    attributes = {key: value for key, value in episode.attributes.items() if key != "env_args"}
     return replace(episode, attributes=attributes)

@@ -98,8 +98,7 @@ class Run:
         return opened.__exit__(*error)
 
     def __getstate__(self) -> dict[str, Any]:
-        kept = ("settings", "folder", "tasks")
-        return {name: self.__dict__[name] for name in kept}
+        return {name: self.__dict__[name] for name in ("settings", "folder", "tasks")}
 
     # -- tasks ---------------------------------------------------------------------------------
 

@@ -1,11 +1,4 @@
-"""Detects training that diverged or collapsed, and raises an error that names likely causes.
-
-Example:
-    >>> check_metrics({"loss_qvalue": float("nan")}, "bcq lift, update 100")
-    Traceback (most recent call last):
-    ...
-    torchrl_bmrl.errors.BMRLError: bcq lift, update 100: loss_qvalue is nan; ...
-"""
+"""Detects training that diverged or collapsed, and raises an error that names likely causes."""
 
 from __future__ import annotations
 
