@@ -5,9 +5,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from operator import ge, gt, le
 from typing import Any
 
 from torchrl_bmrl.errors import ConfigError, UnknownNameError
+
+_LIMITS = {"above": ("above", gt), "at_least": ("at least", ge), "at_most": ("at most", le)}
 
 
 def setting(
@@ -80,14 +83,21 @@ def check_settings(settings: Any, prefix: str = "") -> None:
 def _check(name: str, value: Any, valid: Mapping[str, Any]) -> None:
     if valid["unique"] and (not value or any(x in value[:i] for i, x in enumerate(value))):
         raise ConfigError(f"{name} is {value}; valid: at least one value, each once")
+    limits = [(*_LIMITS[key], valid[key]) for key in _LIMITS if valid[key] is not None]
     for key, item in _items(name, value):
         if valid["choices"]:
             if item not in valid["choices"]:
                 raise UnknownNameError(name, item, valid["choices"])
             continue
-        # A reference to another value may bring a text.
-        if item is not None and not (isinstance(item, int | float) and _is_within(item, valid)):
-            raise ConfigError(f"{key} is {item!r}; valid: {_describe(valid)}")
+        # A reference to another setting may give a text.
+        if item is not None and not (isinstance(item, int | float) and _is_within(item, limits)):
+            text = " and ".join(f"{words} {limit:g}" for words, _, limit in limits)
+            raise ConfigError(f"{key} is {item!r}; valid: {text}")
+
+
+def _is_within(number: float, limits: Sequence[tuple[str, Any, float]]) -> bool:
+    within = all(compare(number, limit) for _, compare, limit in limits)
+    return within and (not limits or math.isfinite(number))
 
 
 def _items(name: str, value: Any) -> Iterator[tuple[str, Any]]:
@@ -98,21 +108,3 @@ def _items(name: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield from ((name, item) for item in value)
     else:
         yield name, value
-
-
-def _is_within(number: float, valid: Mapping[str, Any]) -> bool:
-    above, low, high = valid["above"], valid["at_least"], valid["at_most"]
-    if above is low is high is None:
-        return True
-    return (
-        math.isfinite(number)
-        and (above is None or number > above)
-        and (low is None or number >= low)
-        and (high is None or number <= high)
-    )
-
-
-def _describe(valid: Mapping[str, Any]) -> str:
-    words = {"above": "above", "at_least": "at least", "at_most": "at most"}
-    limits = [f"{text} {valid[key]:g}" for key, text in words.items() if valid[key] is not None]
-    return " and ".join(limits)
