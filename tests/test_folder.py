@@ -26,6 +26,7 @@ from torchrl_bmrl.run.folder import (
     open_run,
     read_settings,
     read_versions,
+    read_yaml,
 )
 
 SETTINGS = {
@@ -286,3 +287,9 @@ def test_a_folder_without_readable_versions_is_refused_by_name(
     with pytest.raises(DataError) as info:
         read_versions(tmp_path)
     assert info.value.path == path
+
+
+@pytest.mark.parametrize("name", ["", "missing.yaml"])
+def test_a_folder_or_nothing_in_place_of_a_yaml_file_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(DataError, match="no such file"):
+        read_yaml(tmp_path / name)

@@ -158,7 +158,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), _Loader)
-    except FileNotFoundError as error:
+    except (FileNotFoundError, IsADirectoryError) as error:
         raise DataError(path, None, "no such file") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise DataError(path, None, f"not YAML ({error})") from error
