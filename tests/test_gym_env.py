@@ -165,6 +165,27 @@ def test_a_step_without_the_key_is_no_success(monkeypatch: pytest.MonkeyPatch) -
     assert data["next", "success"].flatten().tolist() == [False, True, False]
 
 
+@pytest.mark.parametrize("num_envs", [None, 2])
+def test_a_key_of_success_that_info_never_has_is_an_error_at_an_episodes_end(
+    num_envs: int | None,
+) -> None:
+    env = make_gym_env(env="Short-v0", success="solvd", num_envs=num_envs)
+    start = env.reset(seed=9) if num_envs is None else reset(env, 9)
+    started = env.rollout(4, still(0.0), tensordict=start.clone(), auto_reset=False)
+    assert not started["next", "success"].any()  # the key may come at the last step alone
+    start = env.reset(seed=9) if num_envs is None else reset(env, 9)
+    with pytest.raises(ConfigError, match=r"success is 'solvd'.* valid: solved$"):
+        env.rollout(5, still(0.0), tensordict=start, auto_reset=False)
+
+
+def test_failed_episodes_may_lack_the_key_once_it_was_seen() -> None:
+    env = make_gym_env(env="Short-v0", success="solved")
+    (reader,) = env.base_env.info_dict_reader
+    last = TensorDict({"done": torch.tensor(True)})
+    assert reader({"solved": True}, last)["success"]
+    assert not reader({}, last)["success"]
+
+
 def reset(env: Any, seed: int) -> TensorDict:
     return env.reset(list_of_kwargs=[{"seed": seed}] * env.numel())
 

@@ -523,7 +523,7 @@ def test_bounds_that_do_not_fit_are_refused(root: Path) -> None:
         write_episodes(root / ID, make_episodes(), bounds=(-0.1, 0.1))
     with pytest.raises(ConfigError, match=r"bounds is .*; valid: two finite numbers"):
         write_episodes(root / ID, make_episodes(), bounds=(1, -1))
-    with pytest.raises(DataError, match=r"episode_0/actions: shape \(5, 7\), but bounds of 2"):
+    with pytest.raises(DataError, match=r"episode_0/actions: shape \(5, 7\); valid: \(T, 2\)"):
         write_episodes(root / ID, make_episodes(), bounds=([-1, -1], 1))
     assert list((root / "sawyer").iterdir()) == []
 

@@ -382,7 +382,7 @@ def test_the_range_of_the_data_can_be_their_bounds(tmp_path: Path) -> None:
 
 def test_bounds_of_another_size_are_named(tmp_path: Path) -> None:
     path = write(tmp_path / "a.hdf5", next_obs=True)
-    with pytest.raises(DataError, match=r"actions: shape \(20, 7\), but bounds of 2 dimensions"):
+    with pytest.raises(DataError, match=r"actions: shape \(20, 7\); valid: \(T, 2\)"):
         load(path, bounds=([-1, -1], [1, 1]))
     assert len(load(path, bounds=([-1] * 7, 1))) == EPISODES * STEPS
 

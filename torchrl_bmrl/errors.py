@@ -198,7 +198,11 @@ def _plural(noun: str) -> str:
     Example:
         >>> [_plural(noun) for noun in ("task", "policy", "loss", "key")]
         ['tasks', 'policies', 'losses', 'keys']
+        >>> _plural("option of task lift")
+        'options of task lift'
     """
+    noun, of, whole = noun.partition(" of ")
     if noun.endswith("y") and noun[-2:-1] not in set("aeiou"):
-        return f"{noun[:-1]}ies"
-    return f"{noun}es" if noun.endswith(("s", "x", "ch", "sh")) else f"{noun}s"
+        return f"{noun[:-1]}ies{of}{whole}"
+    ending = "es" if noun.endswith(("s", "x", "ch", "sh")) else "s"
+    return f"{noun}{ending}{of}{whole}"

@@ -87,7 +87,8 @@ def read_demonstrations(
             path, "obs", f"does not make an observation of task {task.name} ({error})"
         ) from error
     if task.success is not None and data.get(("next", "success"), None) is None:
-        raise DataError(path, "data", "no successes; valid: successes (T,) in every demonstration")
+        message = "no successes; valid: successes (T,) in every demonstration, or a task without "
+        raise DataError(path, "data", message + "the key success")
     if task.record is not None and data["next", "terminated"].any():
         raise DataError(path, "terminated", "an episode terminates; valid: none, horizons truncate")
     return data.set("task", torch.full((len(data),), index))

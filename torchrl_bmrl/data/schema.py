@@ -96,7 +96,9 @@ def _bound_problems(actions: np.ndarray, bounds: Bounds) -> Iterator[tuple[str, 
     low, high = (np.asarray(bound, dtype=np.float64) for bound in bounds)
     for bound in (low, high):
         if bound.ndim and bound.shape != actions.shape[1:]:
-            yield "actions", f"shape {actions.shape}, but bounds of {bound.shape[0]} dimensions"
+            size = bound.shape[0]
+            problem = f"shape {actions.shape}; valid: (T, {size}), the size of the bounds"
+            yield "actions", problem
             return
     slack = ACTION_TOLERANCE * np.maximum(1, np.maximum(np.abs(low), np.abs(high)))
     outside = np.argwhere((actions < low - slack) | (actions > high + slack))

@@ -31,7 +31,8 @@ def make_gym_env(
         num_envs: number of environments; ``None`` for one without a batch dimension.
         env: gymnasium's id, such as ``"HalfCheetah-v5"`` or ``"module:MyEnv-v0"``.
         env_options: keyword arguments of ``gymnasium.make``.
-        success: key of ``info`` that becomes ``success (*B,)``; ``None``: there is none.
+        success: key of ``info`` that becomes ``success (*B,)``; ``None``: there is none. A key
+            that ``info`` does not contain is an error at the end of the first episode.
 
     Returns:
         an environment with batch ``[]`` or ``[num_envs]``.
@@ -52,10 +53,11 @@ def make_gym_env(
         made = make() if num_envs is None else SerialEnv(num_envs, make)
     except (gymnasium.error.Error, ImportError, TypeError) as error:
         raise ConfigError(f"env is {env}: gymnasium cannot make it ({error})") from error
-    space = made.action_spec.space
-    if not isinstance(made.action_spec, Bounded) or not (space.high - space.low).isfinite().all():
+    spec = made.action_spec
+    if not isinstance(spec, Bounded) or not (spec.space.high - spec.space.low).isfinite().all():
         raise ConfigError(
-            f"env is {env}, whose actions are {made.action_spec}; valid: numbers between bounds"
+            f"env is {env}, whose actions are {type(spec).__name__} of shape {tuple(spec.shape)}; "
+            "valid: numbers between bounds"
         )
     return TransformedEnv(made, ActionScaling(), auto_unwrap=True)
 
@@ -114,13 +116,25 @@ def _make_one(env: str, env_options: dict[str, Any], success: str | None) -> Env
 
 
 class _SuccessReader(BaseInfoDictReader):
-    """Writes a value of ``info`` as ``success ()``; TorchRL's own reader refuses Python's bools."""
+    """Writes a value of ``info`` as ``success ()``; TorchRL's own reader refuses Python's bools.
+
+    Raises:
+        ConfigError: at the end of the first episode, if ``info`` never contained the key.
+    """
 
     def __init__(self, key: str) -> None:
         self.key = key
+        self.seen: set[str] = set()
 
     def __call__(self, info: Mapping[str, Any], tensordict: TensorDictBase) -> TensorDictBase:
         # Some environments give the value at the last step alone.
+        self.seen.update(info)
+        if self.key not in self.seen and bool(tensordict.get("done", False)):
+            keys = ", ".join(sorted(self.seen)) or "none, since info is empty"
+            raise ConfigError(
+                f"success is {self.key!r}, but info has no such key in the first episode; "
+                f"valid: {keys}"
+            )
         return tensordict.set("success", torch.tensor(bool(info.get(self.key, False))))
 
     def reset(self) -> None:

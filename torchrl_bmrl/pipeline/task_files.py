@@ -9,7 +9,7 @@ from typing import Any
 
 from torchrl_bmrl.data.options import ReadOptions
 from torchrl_bmrl.envs.gym import make_gym_env
-from torchrl_bmrl.errors import ConfigError
+from torchrl_bmrl.errors import BMRLError, ConfigError
 from torchrl_bmrl.run.folder import read_yaml
 from torchrl_bmrl.tasks import DemonstrationFiles, Task, get_task
 
@@ -58,8 +58,11 @@ def read_task_file(path: str | Path) -> dict[str, dict[str, Any]]:
     """
     path = Path(path)
     content = read_yaml(path)
-    if not content or not all(isinstance(entry, dict) for entry in content.values()):
-        raise ConfigError(f"{path}: valid: a mapping from each task's name to its description")
+    if not content:
+        raise ConfigError(f"{path}: no tasks; valid: a mapping from each task's name to its keys")
+    for name, entry in content.items():
+        if not isinstance(entry, dict):
+            raise ConfigError(f"{path}: task {name} is {entry!r}; valid: a mapping of keys")
     tasks = {str(name): dict(entry) for name, entry in content.items()}
     for entry in tasks.values():
         if isinstance(entry.get("demonstrations"), str):

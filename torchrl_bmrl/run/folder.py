@@ -161,19 +161,28 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except (FileNotFoundError, IsADirectoryError) as error:
         raise DataError(path, None, "no such file") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise DataError(path, None, f"not YAML ({error})") from error
+        raise DataError(path, None, f"not YAML ({' '.join(str(error).split())})") from error
     if not isinstance(content, dict):
-        raise DataError(path, None, f"contains a {type(content).__name__}; valid: a mapping")
+        found = "is empty" if content is None else f"contains a {type(content).__name__}"
+        raise DataError(path, None, f"{found}; valid: a mapping")
     return content
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuses references: a few lines of them can expand to more than any memory."""
+    """Refuses repeated keys, and references: a few of these can expand to more than any memory."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError("contains a reference; valid: values written out")
         return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value in seen:
+                raise yaml.YAMLError(f"contains the key {key.value} twice; valid: each key once")
+            seen.add(key.value if isinstance(key, yaml.ScalarNode) else None)
+        return super().construct_mapping(node, deep)
 
 
 def read_versions(run_dir: Path) -> dict[str, str]:
