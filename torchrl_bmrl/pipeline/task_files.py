@@ -128,7 +128,10 @@ def _make_task(name: str, entry: Mapping[str, Any]) -> Task:
         if not missing and (isinstance(value, bool) or not is_valid(value)):
             raise ConfigError(f"task {name}: {key} is {value!r}; valid: {valid}")
     read = entry.get("read") or {}
-    ReadOptions.from_mapping(read)  # raises its error now and not in the middle of a run
+    try:
+        ReadOptions.from_mapping(read)  # raises its error now and not in the middle of a run
+    except BMRLError as error:
+        raise ConfigError(f"task {name}: read: {error}") from error
     parts, env, success = entry.get("parts"), entry.get("env"), entry.get("success")
     files = DemonstrationFiles(
         path=str(entry["demonstrations"]),
