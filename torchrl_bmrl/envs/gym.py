@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from functools import partial
 from importlib import import_module
@@ -16,6 +17,8 @@ from torchrl.envs.transforms import ActionScaling, DoubleToFloat
 
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.extras import needs
+
+log = logging.getLogger(__name__)
 
 
 def make_gym_env(
@@ -32,7 +35,7 @@ def make_gym_env(
         env: gymnasium's id, such as ``"HalfCheetah-v5"`` or ``"module:MyEnv-v0"``.
         env_options: keyword arguments of ``gymnasium.make``.
         success: key of ``info`` that becomes ``success (*B,)``; ``None``: there is none. A key
-            that ``info`` does not contain is an error at the end of the first episode.
+            that ``info`` did not contain in the first episode is logged as a warning.
 
     Returns:
         an environment with batch ``[]`` or ``[num_envs]``.
@@ -116,11 +119,7 @@ def _make_one(env: str, env_options: dict[str, Any], success: str | None) -> Env
 
 
 class _SuccessReader(BaseInfoDictReader):
-    """Writes a value of ``info`` as ``success ()``; TorchRL's own reader refuses Python's bools.
-
-    Raises:
-        ConfigError: at the end of the first episode, if ``info`` never contained the key.
-    """
+    """Writes a value of ``info`` as ``success ()``; TorchRL's own reader refuses Python's bools."""
 
     def __init__(self, key: str) -> None:
         self.key = key
@@ -130,11 +129,14 @@ class _SuccessReader(BaseInfoDictReader):
         # Some environments give the value at the last step alone.
         self.seen.update(info)
         if self.key not in self.seen and bool(tensordict.get("done", False)):
-            keys = ", ".join(sorted(self.seen)) or "none, since info is empty"
-            raise ConfigError(
-                f"success is {self.key!r}, but info has no such key in the first episode; "
-                f"valid: {keys}"
+            # Perhaps a wrong key. But some environments give it only when the task succeeds.
+            keys = ", ".join(sorted(self.seen)) or "none"
+            log.warning(
+                "success is %r, which info did not contain in an episode; keys of info: %s",
+                self.key,
+                keys,
             )
+            self.seen.add(self.key)  # one warning is enough
         return tensordict.set("success", torch.tensor(bool(info.get(self.key, False))))
 
     def reset(self) -> None:
