@@ -168,12 +168,12 @@ def test_a_worker_killed_in_an_episode_changes_no_byte(
     tmp_path: Path,
     collected: dict[str, Path],
     patch_workers: Callable[..., None],
-    capfd: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     patch_workers(KILL_THE_FIRST.format(flag=str(tmp_path / "killed")))
     again = run(tmp_path / "two", workers=2)
     assert (tmp_path / "killed").exists()
-    said = [line for line in capfd.readouterr().err.splitlines() if "retried" in line]
+    said = [message for message in caplog.messages if "by signal" in message]
     assert len(said) == 1
     assert said[0].startswith("collecting demonstrations: a worker was killed by signal 9")
     for task, path in collected.items():

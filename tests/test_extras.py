@@ -220,7 +220,7 @@ def test_a_command_without_its_packages_is_one_line_and_exit_code_1(name: str) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "package", ["filelock", "gymnasium", "h5py", "hydra", "matplotlib", "safetensors", "tqdm"]
+    "package", ["filelock", "h5py", "hydra", "matplotlib", "safetensors", "tqdm"]
 )
 def test_a_recipe_without_one_of_its_packages_is_one_line(package: str) -> None:
     for needed in ("hydra", "robosuite", "matplotlib"):  # what comes first would be named instead
@@ -228,6 +228,17 @@ def test_a_recipe_without_one_of_its_packages_is_one_line(package: str) -> None:
     done = command("recipes/two_stage.py", [package], "--help")
     assert_one_line(done)
     assert f"no {package}; " in done.stderr
+
+
+@pytest.mark.slow
+def test_a_run_without_gymnasium_is_one_line(tmp_path: Path) -> None:
+    for needed in ("hydra", "robosuite", "matplotlib"):
+        pytest.importorskip(needed, exc_type=ImportError)
+    settings = ["preset=smoke", "workers=1", f"run_dir={tmp_path / 'run'}"]
+    done = command("recipes/two_stage.py", ["gymnasium"], *settings)
+    assert_one_line(done)
+    assert "no gymnasium; " in done.stderr
+    assert not (tmp_path / "run").exists()
 
 
 def test_another_error_of_a_command_keeps_its_traceback() -> None:

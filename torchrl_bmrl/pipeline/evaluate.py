@@ -264,8 +264,9 @@ def run_facts(run: Run) -> dict[str, str]:
             "Seed of the starts": str(settings.seed),
         } | used
     counts = settings.collect.train_episodes
-    recorded = ", ".join(f"{name} {count}" for name, count in counts.items())
-    sources = [f"{recorded}; {settings.collect.valid_episodes} held out of each"] if counts else []
+    recorded = [f"{task.name} {counts[task.name]}" for task in run.tasks if task.record]
+    held_out = f"{settings.collect.valid_episodes} held out of each"
+    sources = [f"{', '.join(recorded)}; {held_out}"] if recorded else []
     sources += [f"{task.name} from {task.files.path}" for task in run.tasks if task.files]
     ablation = f", {settings.ablation}" if settings.ablation != "none" else ""
     return {
