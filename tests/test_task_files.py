@@ -6,10 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 pytest.importorskip("gymnasium")
 pytest.importorskip("h5py")
+pytest.importorskip("tqdm")
+pytest.importorskip("yaml")
+
+import yaml
 
 from torchrl_bmrl.envs.gym import make_gym_env
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
