@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -59,6 +60,22 @@ def configured(*overrides: str) -> DictConfig:
 def make_run(folder: Path, *overrides: str) -> pipeline.Run:
     """The run that the small settings describe, not open."""
     return pipeline.Run(settings_of(*SMALL, f"run_dir={folder}", *overrides))
+
+
+def study_run(folder: Path, bcq: dict[str, Any] | None = None, **settings: Any) -> pipeline.Run:
+    """A small run for a study, from settings made in Python, not open."""
+    stage1 = {"epochs": 2, "updates_per_epoch": 6, "batch_size": 8, "num_cells": [16, 16]}
+    return pipeline.Run(
+        pipeline.Settings(
+            run_dir=str(folder),
+            workers=1,
+            tasks=TASKS,
+            collect=pipeline.CollectSettings(train_episodes={"default": 1}, valid_episodes=1),
+            bcq=pipeline.BCQSettings(**{**stage1, **(bcq or {})}),
+            evaluate=pipeline.EvaluateSettings(episodes=2, num_candidates=5),
+            **settings,
+        )
+    )
 
 
 def settings_of(*overrides: str) -> pipeline.Settings:

@@ -18,7 +18,7 @@ pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 pytest.importorskip("robosuite", exc_type=ImportError)
 
-from small_runs import TASKS, Interruption, contents
+from small_runs import TASKS, Interruption, contents, study_run
 from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.envs.transforms import Compose
@@ -26,9 +26,6 @@ from torchrl.envs.transforms import Compose
 from torchrl_bmrl.errors import BMRLError, StoppedError
 from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
 from torchrl_bmrl.pipeline import (
-    BCQSettings,
-    CollectSettings,
-    EvaluateSettings,
     Run,
     Settings,
     collect,
@@ -54,19 +51,7 @@ OBSERVATION_DIM, ACTION_DIM = 33, 7
 
 
 def make_run(folder: Path, **bcq: Any) -> Run:
-    bcq = {"epochs": 2, "updates_per_epoch": 6, "batch_size": 8, "num_cells": [16, 16]} | bcq
-    return Run(
-        Settings(
-            run_dir=str(folder),
-            workers=1,
-            tasks=TASKS,
-            log_interval=4,
-            checkpoint_interval=4,
-            collect=CollectSettings(train_episodes={"default": 1}, valid_episodes=1),
-            bcq=BCQSettings(**bcq),
-            evaluate=EvaluateSettings(episodes=2, num_candidates=5),
-        )
-    )
+    return study_run(folder, bcq, log_interval=4, checkpoint_interval=4)
 
 
 @pytest.fixture(scope="module")

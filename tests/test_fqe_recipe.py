@@ -18,15 +18,10 @@ pytest.importorskip("safetensors")
 pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
-from small_runs import TASKS, Interruption, contents
+from small_runs import Interruption, contents, study_run
 
 from torchrl_bmrl.errors import BMRLError, StoppedError
 from torchrl_bmrl.pipeline import (
-    BCQSettings,
-    CollectSettings,
-    EvaluateSettings,
-    Run,
-    Settings,
     collect,
     stage1,
 )
@@ -38,25 +33,12 @@ UPDATES = [3, 6, 12]
 SERIES = FQESettings(checkpoints=UPDATES, updates=8, num_candidates=3)
 
 
-def make_run(folder: Path) -> Run:
-    return Run(
-        Settings(
-            run_dir=str(folder),
-            workers=1,
-            tasks=TASKS,
-            collect=CollectSettings(train_episodes={"default": 1}, valid_episodes=1),
-            bcq=BCQSettings(epochs=2, updates_per_epoch=6, batch_size=8, num_cells=[16, 16]),
-            evaluate=EvaluateSettings(episodes=2, num_candidates=5),
-        )
-    )
-
-
 @pytest.fixture(scope="module")
 def studied(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder with demonstrations, stage 1 and the study."""
     pytest.importorskip("robosuite", exc_type=ImportError)
     folder = tmp_path_factory.mktemp("studied")
-    with make_run(folder) as run:
+    with study_run(folder) as run:
         collect(run)
         stage1(run)
         assert "| Reach |" in fqe(run, SERIES)
@@ -100,7 +82,7 @@ def test_what_is_there_is_read_back_and_what_is_missing_made_again_the_same(stud
     files = list((studied / "fqe").glob("*/*"))
     written = {path: path.stat().st_mtime_ns for path in files}
     (studied / "fqe" / "lift" / "6.csv").unlink()
-    with make_run(studied) as run:
+    with study_run(studied) as run:
         fqe(run, SERIES)
         assert contents(studied, "fqe/**/*.csv", "fqe.csv", "tables/fqe.*") == before
         again = [path.name for path in files if path.stat().st_mtime_ns != written[path]]
@@ -113,7 +95,7 @@ def test_what_is_there_is_read_back_and_what_is_missing_made_again_the_same(stud
 @pytest.mark.slow
 def test_a_stopped_series_saves_no_agent_between_its_numbers(studied: Path, tmp_path: Path) -> None:
     shutil.copytree(studied / "data", tmp_path / "data")
-    job = (make_run(tmp_path), ("lift", UPDATES))
+    job = (study_run(tmp_path), ("lift", UPDATES))
     with pytest.raises(StoppedError):
         train_job(job, Interruption(4, StoppedError))
     assert [path.name for path in (tmp_path / "fqe" / "lift").iterdir()] == ["3.safetensors"]
@@ -124,7 +106,7 @@ def test_a_stopped_series_saves_no_agent_between_its_numbers(studied: Path, tmp_
 
 @pytest.mark.robosuite
 def test_without_demonstrations_the_error_names_the_recipe_that_writes_them(tmp_path: Path) -> None:
-    with make_run(tmp_path) as run:
+    with study_run(tmp_path) as run:
         with pytest.raises(BMRLError, match=r"recipes/collect.py writes it"):
             fqe(run, SERIES)
         assert not (tmp_path / "fqe").exists()
@@ -151,7 +133,7 @@ def test_a_series_is_at_least_two_numbers_from_low_to_high(
     tmp_path: Path, series: list[int]
 ) -> None:
     with (
-        make_run(tmp_path) as run,
+        study_run(tmp_path) as run,
         pytest.raises(BMRLError, match=r"fqe.checkpoints is .*; valid: at least two, from low"),
     ):
         fqe(run, FQESettings(checkpoints=series))

@@ -17,13 +17,10 @@ pytest.importorskip("safetensors")
 pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
-from small_runs import HORIZON, TASKS, times
+from small_runs import HORIZON, TASKS, study_run, times
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.pipeline import (
-    BCQSettings,
-    CollectSettings,
-    EvaluateSettings,
     Run,
     Settings,
     collect,
@@ -31,20 +28,6 @@ from torchrl_bmrl.pipeline import (
 from torchrl_bmrl.run.settings import check_settings
 from torchrl_bmrl.studies import people
 from torchrl_bmrl.studies.people import HumanSettings, learn_from_people, make_table
-
-
-def make_run(folder: Path, **settings: Any) -> Run:
-    return Run(
-        Settings(
-            run_dir=str(folder),
-            workers=1,
-            tasks=TASKS,
-            collect=CollectSettings(train_episodes={"default": 1}, valid_episodes=1),
-            bcq=BCQSettings(epochs=2, updates_per_epoch=6, batch_size=8, num_cells=[16, 16]),
-            evaluate=EvaluateSettings(episodes=2, num_candidates=5),
-            **settings,
-        )
-    )
 
 
 @pytest.mark.parametrize(
@@ -72,7 +55,7 @@ def test_an_error_at_the_start_leaves_no_file(
     tmp_path: Path, values: dict[str, Any], says: str
 ) -> None:
     folder = tmp_path / "run"
-    with pytest.raises(BMRLError, match=says), make_run(folder) as run:
+    with pytest.raises(BMRLError, match=says), study_run(folder) as run:
         learn_from_people(run, HumanSettings(**values))
     assert not folder.exists()
 
@@ -105,13 +88,13 @@ def test_every_share_is_trained_on_its_transitions_compared_and_read_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("robosuite", exc_type=ImportError)
-    with make_run(tmp_path / "others", seed=1) as run:
+    with study_run(tmp_path / "others", seed=1) as run:
         collect(run)
     # Any file with the task's observation may stand for human demonstrations.
     path = shutil.copy(run.demonstrations("lift"), tmp_path / "human.hdf5")
     settings = HumanSettings(path=str(path), shares=[1.0], training_seeds=1)
     folder = tmp_path / "run"
-    with make_run(folder) as run:
+    with study_run(folder) as run:
         text = learn_from_people(run, settings)
         assert text == (folder / "tables" / "human.md").read_text()
         lines = (folder / "tables" / "human.csv").read_text().splitlines()[1:]
