@@ -602,3 +602,13 @@ def test_bad_input_leaves_the_old_report(tmp_path: Path) -> None:
     path.write_text("epoch,episode,return\n")
     with pytest.raises(DataError, match=r"evaluations\.csv: update: column is missing"):
         write_report(tmp_path, default_source="online", facts={})
+
+
+@pytest.mark.parametrize(("expert", "lowest"), [({}, -5.0), ({"still": -20.0}, -20.0)])
+def test_curves_below_zero_lie_within_the_axes(
+    expert: dict[str, float], lowest: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Any] = []
+    monkeypatch.setattr("torchrl_bmrl.reports.figures.png", lambda figure: drawn.append(figure))
+    stage1_curves({"still": [(1, 10, np.array([-5.0, -1.0]))]}, expert_means=expert)
+    assert drawn[0].axes[0].get_ylim()[0] < lowest
