@@ -604,11 +604,27 @@ def test_bad_input_leaves_the_old_report(tmp_path: Path) -> None:
         write_report(tmp_path, default_source="online", facts={})
 
 
-@pytest.mark.parametrize(("expert", "lowest"), [({}, -5.0), ({"still": -20.0}, -20.0)])
-def test_curves_below_zero_lie_within_the_axes(
-    expert: dict[str, float], lowest: float, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("returns", "expert", "low", "high"),
+    [
+        ([-5.0, -1.0], None, -5.0, 0.0),
+        ([-5.0, -1.0], -20.0, -20.0, 0.0),
+        ([198.0, 198.1], None, 0.0, 198.1),
+        ([300.0, 310.0], 400.0, 0.0, 400.0),
+    ],
+)
+def test_the_axes_of_curves_include_zero_and_have_a_margin_around_the_returns(
+    returns: list[float],
+    expert: float | None,
+    low: float,
+    high: float,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     drawn: list[Any] = []
     monkeypatch.setattr("torchrl_bmrl.reports.figures.png", lambda figure: drawn.append(figure))
-    stage1_curves({"still": [(1, 10, np.array([-5.0, -1.0]))]}, expert_means=expert)
-    assert drawn[0].axes[0].get_ylim()[0] < lowest
+    expert_means = None if expert is None else {"still": expert}
+    stage1_curves({"still": [(1, 10, np.array(returns))]}, expert_means=expert_means)
+    bottom, top = drawn[0].axes[0].get_ylim()
+    margin = 0.03 * (high - low)
+    assert bottom == 0 if low == 0 else bottom < low - margin
+    assert top == 0 if high == 0 else top > high + margin

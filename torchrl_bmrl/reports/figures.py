@@ -64,12 +64,11 @@ def stage1_curves(
         std = np.array([returns.std() for _, _, returns in curves[task]])
         axes.fill_between(epochs, mean - std, mean + std, color=color, alpha=0.25, linewidth=0)
         axes.plot(epochs, mean, color=color, marker="o", markersize=3)
-        lowest = min(0.0, (mean - std).min())
         if expert_means and task in expert_means:
             axes.axhline(expert_means[task], color=GREY, linestyle="--", linewidth=1)
-            lowest = min(lowest, expert_means[task])
         axes.set_title(title, fontsize=10)
-        axes.set_ylim(bottom=1.05 * lowest)
+        # The axes include zero; all other ends have Matplotlib's margin.
+        axes.axhline(0.0, alpha=0.0).sticky_edges.y.append(0.0)
         axes.xaxis.get_major_locator().set_params(integer=True)
         tidy(axes)
     for axes in panels:  # the remaining panels are empty
