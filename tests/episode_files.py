@@ -18,7 +18,6 @@ from torchrl_bmrl.data.schema import arrays_of
 
 Parts = Mapping[str, tuple[tuple[int, ...], Any]]
 """Shape of a row and dtype of each part of an observation."""
-
 PARTS: Parts = {"object": ((10,), np.float64), "image": ((8, 8, 3), np.uint8)}
 """Other parts than the six tasks have: any robot's observations can be stored."""
 OBSERVATION_SHAPES: dict[str, int] = {

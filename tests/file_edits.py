@@ -12,7 +12,6 @@ import numpy as np
 
 Edit = Callable[[Any], object]
 """Changes an open HDF5 file or a group of it."""
-
 LFS_POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 12345\n"
 """What Git stores in place of a file that it keeps in LFS."""
 

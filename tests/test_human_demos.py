@@ -20,15 +20,9 @@ from torchrl_bmrl.data.robosuite import TRACKING, open_episodes
 from torchrl_bmrl.errors import DataError
 
 pytestmark = pytest.mark.robosuite
-
-
 HUMAN = Path(__file__).parents[2] / "shared/data/human_sawyer_lift"
-
-
 CUBE_Z = 13
 """Column of the cube's height in the states of 2018."""
-
-
 QUATERNION = slice(14, 18)
 
 

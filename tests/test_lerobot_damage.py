@@ -87,8 +87,6 @@ FAULTS: dict[str, tuple[Callable[[Columns], object], str]] = {
 
 ONE_SCHEMA = ("no action", "no index", "no flag", "pairs of rewards", "uneven time")
 """Faults that need another schema, so that episodes in the same file must have them too."""
-
-
 CASES = [("v2.1", fault) for fault in FAULTS]
 CASES += [("v3.0", fault) for fault in FAULTS if fault not in ONE_SCHEMA]
 

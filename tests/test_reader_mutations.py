@@ -27,8 +27,6 @@ from torchrl_bmrl.data.raw import RawEpisode, complete
 from torchrl_bmrl.errors import DataError
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:minari")
-
-
 SEEDS = 4
 """Times that each structural mutation is tried, at other places."""
 

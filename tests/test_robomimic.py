@@ -38,8 +38,6 @@ from torchrl_bmrl.data.sources import Source, open_source
 from torchrl_bmrl.errors import DataError
 
 DEMO = "data/demo_1"
-
-
 ROWS = LENGTHS[1]
 
 

@@ -25,8 +25,6 @@ from torchrl_bmrl.data.robomimic import (
 from torchrl_bmrl.errors import DataError
 
 DEMO = "data/demo_1"
-
-
 ROWS = LENGTHS[1]
 
 
