@@ -21,6 +21,8 @@ torch.set_num_threads(1)
 # Modules whose import, or whose docstrings' examples, need an extra.
 _NEEDS = {
     "gymnasium": [
+        "tests/minari_files.py",
+        "tests/tool_files.py",
         "torchrl_bmrl/data/convert.py",
         "torchrl_bmrl/data/demonstrations.py",
         "torchrl_bmrl/envs/*",
@@ -41,16 +43,33 @@ _NEEDS = {
                 "robosuite",
             )
         ),
-        "tests/episode_files.py",
+        *(
+            f"tests/{name}.py"
+            for name in (
+                "d4rl_files",
+                "d4rl_mutations",
+                "episode_files",
+                "file_edits",
+                "lerobot_files",
+                "minari_files",
+                "minari_mutations",
+                "mutations",
+                "reader_edits",
+                "recordings",
+                "tool_files",
+            )
+        ),
         "torchrl_bmrl/experts/*",
         "torchrl_bmrl/reports/films.py",
     ],
     "hydra": ["tests/small_runs.py", "torchrl_bmrl/configs.py"],
     "matplotlib": ["tests/published_data.py", "torchrl_bmrl/reports/*"],
-    "minari": ["torchrl_bmrl/data/convert.py"],
+    "minari": ["tests/minari_files.py", "torchrl_bmrl/data/convert.py"],
     "mujoco": ["torchrl_bmrl/reports/films.py"],
     "onnxscript": ["torchrl_bmrl/export.py"],
+    "pyarrow": ["tests/lerobot_files.py"],
     "robosuite": [
+        "tests/recordings.py",
         "torchrl_bmrl/envs/*",
         "torchrl_bmrl/evaluation/rollout.py",
         "torchrl_bmrl/experts/*",
@@ -59,6 +78,7 @@ _NEEDS = {
     "scipy": ["torchrl_bmrl/evaluation/*", "torchrl_bmrl/reports/*"],
     "sklearn": ["torchrl_bmrl/evaluation/embedding.py", "torchrl_bmrl/reports/figures.py"],
     "tqdm": [
+        "tests/tool_files.py",
         "torchrl_bmrl/data/__main__.py",
         "torchrl_bmrl/run/workers.py",
         "torchrl_bmrl/run/progress.py",

@@ -1,4 +1,4 @@
-"""Fixtures of the tests that run recipes; those without these packages never ask for them."""
+"""Fixtures that several test files share; they import the packages that they need when used."""
 
 from __future__ import annotations
 
@@ -41,6 +41,29 @@ def own_logging() -> Iterator[None]:
     reset()
     yield
     reset()
+
+
+@pytest.fixture
+def converted(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Source files of the conversions that a test makes, in order."""
+    from torchrl_bmrl.data import datasets
+
+    sources: list[Path] = []
+    convert = datasets._convert
+
+    def record(source: Path, *args: Any) -> None:
+        sources.append(source)
+        convert(source, *args)
+
+    monkeypatch.setattr(datasets, "_convert", record)
+    return sources
+
+
+@pytest.fixture
+def minari_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder in which Minari and TorchRL look for data sets."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    return tmp_path / "minari"
 
 
 @pytest.fixture(scope="module")

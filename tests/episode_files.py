@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -9,16 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from torchrl_bmrl.data.episodes import Episode
-from torchrl_bmrl.data.robomimic import write_episodes
+from torchrl_bmrl.data.robomimic import open_episodes, write_episodes
 from torchrl_bmrl.data.schema import arrays_of
 
 Parts = Mapping[str, tuple[tuple[int, ...], Any]]
 """Shape of a row and dtype of each part of an observation."""
-
 PARTS: Parts = {"object": ((10,), np.float64), "image": ((8, 8, 3), np.uint8)}
-"""Not the six tasks': any robot's observations will do."""
+"""Other parts than the six tasks have: any robot's observations can be stored."""
 OBSERVATION_SHAPES: dict[str, int] = {
     "robot0_joint_pos": 7,
     "robot0_gripper_qpos": 2,
@@ -85,11 +86,16 @@ def changed(key: str, row: int, value: Any) -> Episode:
     return with_array(make_episode(), key, array)
 
 
+def file_episodes(lengths: Sequence[int] = LENGTHS, parts: Parts = PARTS) -> list[Episode]:
+    """The episodes that :func:`write_file` writes."""
+    return [make_episode(i, steps, parts=parts) for i, steps in enumerate(lengths)]
+
+
 def write_file(
     path: Path, lengths: Sequence[int] = LENGTHS, *, train: int = 3, parts: Parts = PARTS
 ) -> list[Episode]:
-    """Writes episodes of these lengths, the first ``train`` of them to train on."""
-    episodes = [make_episode(i, steps, parts=parts) for i, steps in enumerate(lengths)]
+    """Writes episodes of these lengths; the first ``train`` of them are in the mask "train"."""
+    episodes = file_episodes(lengths, parts)
     write_episodes(
         path,
         iter(episodes),
@@ -98,6 +104,28 @@ def write_file(
         masks={"train": range(train), "valid": range(train, len(lengths))},
     )
     return episodes
+
+
+def lift_file(folder: Path) -> Path:
+    """Path of a new file of four episodes, named lift.hdf5."""
+    write_file(folder / "lift.hdf5")
+    return folder / "lift.hdf5"
+
+
+def read_file(path: Path, **options: Any) -> dict[str, Episode]:
+    """All episodes of a file by name."""
+    with open_episodes(path, **options) as episodes:
+        return dict(episodes)
+
+
+def joined(episodes: Sequence[Episode], group: str, name: str) -> torch.Tensor:
+    """One array of all episodes, one after the other."""
+    return torch.cat([torch.as_tensor(getattr(episode, group)[name]) for episode in episodes])
+
+
+def entries(folder: Path) -> list[str]:
+    """Sorted names of what is in a folder."""
+    return sorted(os.listdir(folder))
 
 
 def readers(open_data: Any) -> tuple[Any, Any, Any]:
@@ -131,7 +159,8 @@ def assert_same(read: Episode, made: Episode) -> None:
     assert dict(read.attributes) == dict(made.attributes)
 
 
-def assert_identical(ours: np.ndarray, theirs: np.ndarray) -> None:
-    """Equal shapes, dtypes and bits."""
+def assert_identical(ours: Any, theirs: Any) -> None:
+    """Equal shapes, dtypes and bits, of arrays or tensors."""
+    ours, theirs = np.asarray(ours), np.asarray(theirs)
     np.testing.assert_array_equal(ours, theirs, strict=True)
     assert ours.tobytes() == theirs.tobytes()

@@ -187,7 +187,7 @@ def test_commands_for_data_do_what_the_page_says(
         pytest.importorskip(package)
     pytest.importorskip("robosuite", exc_type=ImportError)
     from episode_files import TASK_PARTS, make_episode
-    from test_robosuite_demos import record
+    from recordings import record
 
     from torchrl_bmrl.data.__main__ import main
     from torchrl_bmrl.data.robomimic import write_episodes

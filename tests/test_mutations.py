@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import multiprocessing
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +16,14 @@ pytest.importorskip("h5py")
 import h5py
 import torch
 from episode_files import write_file
+from file_edits import as_group, rewrite
+from mutations import BYTES, LINK, Outcome, as_pairs, as_text, outcomes_of, try_all
 
 from torchrl_bmrl.data.datasets import RobomimicExperienceReplay
 from torchrl_bmrl.data.robomimic import open_episodes, read_metadata
 from torchrl_bmrl.data.summary import summarise
 from torchrl_bmrl.errors import DataError
 
-Outcome = dict[str, Any]
 LENGTHS = (5, 6, 7)
 NAMES = [f"demo_{i}" for i in range(len(LENGTHS))]
 ARRAYS = ("actions", "rewards", "terminated", "successes", "phases", "states")
@@ -32,84 +31,7 @@ PARTS = tuple(f"{group}/{part}" for group in ("obs", "next_obs") for part in ("o
 FLOATS = ("actions", "rewards", "states", "obs/object", "next_obs/object")
 
 
-# -- bytes: whatever is damaged, the data are the original ones or are refused ---------------------
-
-
-def flip(data: bytearray, rng: np.random.Generator) -> None:
-    data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
-
-
-def flip_text_or_number(data: bytearray, rng: np.random.Generator) -> None:
-    # Much of a file is zeros, which nothing reads.
-    used = np.flatnonzero(np.frombuffer(bytes(data), np.uint8))
-    data[rng.choice(used)] ^= 1 << int(rng.integers(8))
-
-
-def truncate(data: bytearray, rng: np.random.Generator) -> None:
-    del data[rng.integers(len(data)) :]
-
-
-def append(data: bytearray, rng: np.random.Generator) -> None:
-    data += rng.bytes(int(rng.integers(1, 5000)))
-
-
-def block(data: bytearray, rng: np.random.Generator) -> slice:
-    size = int(rng.choice([1, 2, 8, 64, 512, 4096]))
-    start = int(rng.integers(len(data) - size))
-    return slice(start, start + size)
-
-
-def zero(data: bytearray, rng: np.random.Generator) -> None:
-    here = block(data, rng)
-    data[here] = bytes(here.stop - here.start)
-
-
-def fill(data: bytearray, rng: np.random.Generator) -> None:
-    here = block(data, rng)
-    data[here] = b"\xff" * (here.stop - here.start)
-
-
-def overwrite(data: bytearray, rng: np.random.Generator) -> None:
-    here = block(data, rng)
-    data[here] = rng.bytes(here.stop - here.start)
-
-
-def copy_elsewhere(data: bytearray, rng: np.random.Generator) -> None:
-    here = block(data, rng)
-    start = int(rng.integers(len(data) - (here.stop - here.start)))
-    data[start : start + here.stop - here.start] = data[here]
-
-
-def duplicate(data: bytearray, rng: np.random.Generator) -> None:
-    here = block(data, rng)
-    data[here.stop : here.stop] = data[here]
-
-
-def drop(data: bytearray, rng: np.random.Generator) -> None:
-    del data[block(data, rng)]
-
-
-BYTES: dict[str, tuple[Callable[[bytearray, np.random.Generator], None], int]] = {
-    "flipped bit": (flip, 25),
-    "flipped bit in use": (flip_text_or_number, 50),
-    "truncated": (truncate, 10),
-    "bytes appended": (append, 3),
-    "block of zeros": (zero, 12),
-    "block of ones": (fill, 12),
-    "random block": (overwrite, 12),
-    "block copied elsewhere": (copy_elsewhere, 12),
-    "block duplicated": (duplicate, 7),
-    "block removed": (drop, 7),
-}
-
-
 # -- structure: another valid HDF5 file, which is refused with the key at fault --------------------
-
-
-def rewrite(demo: Any, key: str, change: Callable[[np.ndarray], Any]) -> None:
-    value = change(demo[key][()])
-    del demo[key]
-    demo[key] = value
 
 
 def with_value(index: int, value: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -118,19 +40,6 @@ def with_value(index: int, value: float) -> Callable[[np.ndarray], np.ndarray]:
         return array
 
     return change
-
-
-def as_group(demo: Any, key: str) -> None:
-    del demo[key]
-    demo.create_group(key)["x"] = 1.0
-
-
-def as_text(array: np.ndarray) -> np.ndarray:
-    return array.astype(str).astype(h5py.string_dtype())
-
-
-def as_pairs(array: np.ndarray) -> np.ndarray:
-    return np.zeros(len(array), dtype=[("a", float), ("b", np.int8)])
 
 
 Edit = Callable[[Any, str], object]
@@ -176,7 +85,6 @@ STRUCTURAL: dict[str, tuple[Edit, tuple[str, ...]]] = {
     ),
     "terminated at once": (lambda demo, key: rewrite(demo, key, np.ones_like), ("terminated",)),
 }
-LINK = h5py.SoftLink("/nowhere")
 UNREAD = ("phases", "states")
 """A replay buffer loads its data without them, whatever they are."""
 ONE_NUMBER = ("rewards", "terminated", "successes")
@@ -398,37 +306,6 @@ def mutations() -> list[tuple[str, str, int]]:
         *(("other", "group", seed) for seed in range(14)),
         *(("other", "mask", seed) for seed in range(12)),
         *(("other", "attribute", seed) for seed in range(16)),
-    ]
-
-
-def try_all(mutator: Any, mutations: Iterable[tuple[str, str, int]], folder: Path) -> None:
-    """Tries mutations, each in a line of a file: one that ends the process is the last."""
-    os.fsync = lambda descriptor: None  # a power cut is not among the mutations
-    with open(folder / "outcomes.jsonl", "w") as file:
-        for mutation in mutations:
-            file.write(json.dumps({"mutation": mutation}) + "\n")
-            file.flush()
-            form, kind, seed = mutation
-            try:
-                outcome = getattr(mutator, form)(kind, seed)
-            except Exception as error:
-                outcome = {"outcome": f"{type(error).__name__}: {error}", "wrong": True}
-            file.write(json.dumps(outcome) + "\n")
-
-
-def outcomes_of(run: Callable[..., None], folder: Path, *further: str) -> list[tuple[Any, Outcome]]:
-    """What came of every mutation, in a process that a crash of HDF5 may end."""
-    process = multiprocessing.get_context("spawn").Process(target=run, args=(str(folder), *further))
-    process.start()
-    process.join(120)
-    if process.is_alive():
-        process.kill()
-        process.join()
-    lines = [json.loads(line) for line in (folder / "outcomes.jsonl").read_text().splitlines()]
-    assert process.exitcode == 0, f"exit code {process.exitcode} in {lines[-1:]}"
-    return [
-        (mutation["mutation"], outcome)
-        for mutation, outcome in zip(lines[::2], lines[1::2], strict=True)
     ]
 
 
