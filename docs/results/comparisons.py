@@ -59,6 +59,12 @@ def difference(
     )
 
 
+def differences(rows: Sequence[ResultRow], x: Arm, y: Arm) -> dict[str, Estimate]:
+    """The :func:`difference` of two policies by task, where it is known."""
+    found = {task: difference(rows, rows, x, y, [task]) for task in TASKS}
+    return {task: gain for task, gain in found.items() if gain is not None}
+
+
 def improvement(
     rows: Iterable[ResultRow], x: Arm, y: Arm, tasks: Sequence[str] = TASKS
 ) -> Estimate | None:
@@ -95,12 +101,12 @@ def targets_table(
         where = f"{task_name(task)}: [{low:.1%}, {high:.1%}]"
         add(f"{name}: success", 0.95, rate, f"{rate:.1%} ({where})")
 
-    if gains := _by_task(rows, BCQ, EXPERT):
+    if len(gains := differences(rows, BCQ, EXPERT)) == len(TASKS):
         task, gain = min(gains.items(), key=lambda item: item[1].low)
         what = "BCQ over the expert: lower end of the interval of the relative difference"
         add(what, -0.02, gain.low, f"{gain.low:+.1%} ({task_name(task)}: {_signed(gain)})")
     add_success("BCQ", BCQ)
-    if gains := _by_task(rows, DISTILLED, BCQ):
+    if len(gains := differences(rows, DISTILLED, BCQ)) == len(TASKS):
         task, gain = min(gains.items(), key=lambda item: item[1].value)
         value, where = 1 + gain.value, f"{task_name(task)}: {_share(gain)}"
         add("Distilled: return as a share of BCQ's", 0.98, value, f"{value:.1%} ({where})")
@@ -223,8 +229,8 @@ def gains_table(rows: Sequence[ResultRow], pairs: Sequence[tuple[Arm, Arm]]) -> 
     """Relative differences between pairs of policies."""
     lines = []
     for x, y in pairs:
-        each = sorted(_by_task(rows, x, y).items(), key=lambda item: item[1].value)
-        if each and (mean := difference(rows, rows, x, y)) is not None:
+        each = sorted(differences(rows, x, y).items(), key=lambda item: item[1].value)
+        if (mean := difference(rows, rows, x, y)) is not None:
             chance = improvement(rows, x, y)
             ends = [f"{d.value:+.1%} ({task_name(task)})" for task, d in (each[0], each[-1])]
             name = f"{policy_name(x[0])} over {policy_name(y[0])}"
@@ -353,13 +359,6 @@ def _returns(
         for row in rows
         if (row.policy, row.latent_source) == arm and row.task in tasks
     }
-
-
-def _by_task(rows: Sequence[ResultRow], x: Arm, y: Arm) -> dict[str, Estimate]:
-    """Differences of two policies by task; empty if one task is missing."""
-    found = {task: difference(rows, rows, x, y, [task]) for task in TASKS}
-    known = {task: gain for task, gain in found.items() if gain is not None}
-    return known if len(known) == len(TASKS) else {}
 
 
 def _success_rate(rows: Sequence[ResultRow], arm: Arm, tasks: Sequence[str]) -> str:

@@ -16,7 +16,7 @@ from comparisons import (
     Arm,
     ablations_table,
     arms_of,
-    difference,
+    differences,
     differences_table,
     gains_table,
     policies_table,
@@ -28,7 +28,6 @@ from published import MAIN, TASKS, CurveRow, Published, RunRow, read_published
 
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.evaluation.results import ResultRow, Summary, summarise
-from torchrl_bmrl.evaluation.statistics import Estimate
 from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.reports import Picture, Section, paper, results_table, stage1_curves, task_titles
 from torchrl_bmrl.reports.figures import Curve
@@ -139,13 +138,13 @@ def _main_sections(
                     summaries,
                     titles=_TITLES,
                     epochs={task: curve[-1][0] for task, curve in drawn.items()},
-                    differences=_differences(rows, BCQ, EXPERT),
+                    differences=differences(rows, BCQ, EXPERT),
                 ),
                 paper.table_2(
                     [s for s in summaries if s.latent_source in ("", DEFAULT_SOURCE)],
                     titles=_TITLES,
                     default_source=DEFAULT_SOURCE,
-                    differences=_differences(rows, DISTILLED, BCQ),
+                    differences=differences(rows, DISTILLED, BCQ),
                 ),
             ],
         ),
@@ -334,11 +333,6 @@ def _clock_table(runs: Sequence[RunRow]) -> Table:
             for run in runs
         ],
     )
-
-
-def _differences(rows: Sequence[ResultRow], x: Arm, y: Arm) -> dict[str, Estimate]:
-    found = {task: difference(rows, rows, x, y, [task]) for task in TASKS}
-    return {task: gain for task, gain in found.items() if gain is not None}
 
 
 def _markdown(section: Section) -> str:
