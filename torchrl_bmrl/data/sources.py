@@ -209,8 +209,7 @@ def _apply(path: Path, form: str, opened: Opened, options: ReadOptions) -> Sourc
         bounds = options.bounds
     elif stated is not None:
         bounds = stated["low"], stated["high"]
-    if bounds != (-1.0, 1.0):
-        metadata["action_bounds"] = {"low": bounds[0], "high": bounds[1]}
+    metadata |= _stated(bounds)
 
     def read(name: str) -> Episode:
         return complete(path, f"{opened.prefix}{name}", opened.episodes[name], options)
@@ -323,14 +322,18 @@ def _open_robosuite(stack: ExitStack, path: Path, task: str | None, tracking: fl
 
 def with_bounds(sources: Iterable[Source], bounds: Bounds) -> list[Source]:
     """The sources with other bounds of the actions."""
-    stated = (
-        {} if bounds == (-1.0, 1.0) else {"action_bounds": {"low": bounds[0], "high": bounds[1]}}
-    )
     changed = []
     for source in sources:
         kept = {key: value for key, value in source.metadata.items() if key != "action_bounds"}
-        changed.append(replace(source, bounds=bounds, metadata=kept | stated))
+        changed.append(replace(source, bounds=bounds, metadata=kept | _stated(bounds)))
     return changed
+
+
+def _stated(bounds: Bounds) -> dict[str, Any]:
+    """Metadata that states bounds; none for [-1, 1]."""
+    if bounds == (-1.0, 1.0):
+        return {}
+    return {"action_bounds": {"low": bounds[0], "high": bounds[1]}}
 
 
 def with_joint_range(sources: Sequence[Source]) -> list[Source]:
