@@ -79,7 +79,7 @@ def run_recipe(
     with exit_codes(out_of_memory=OUT_OF_MEMORY):
         log_to_stderr(verbose=config.get("verbose") is True)
         try:
-            composed, config = config, with_folders_settings(config)
+            composed, config = config, with_folders_settings(config, section)
             values = OmegaConf.to_object(config)
         except OmegaConfBaseException as error:  # for example a reference to an unknown name
             raise ConfigError(str(error).partition("\n")[0]) from error
@@ -98,17 +98,18 @@ def run_recipe(
                 print(result)
 
 
-def with_folders_settings(config: DictConfig) -> DictConfig:
+def with_folders_settings(config: DictConfig, section: str | None = None) -> DictConfig:
     """Fills in the settings of an existing run folder that the command line does not set.
 
     This requires an explicit ``run_dir``. Settings of the command line are compared with those of
-    the folder when the run is opened.
+    the folder when the run is opened. The settings of a study are those of its own folder.
 
     Args:
         config: configuration of the command line and the preset.
+        section: section of the study's settings.
 
     Raises:
-        BMRLError: if ``run_dir`` is empty, the folder's settings are damaged, or another preset or
+        BMRLError: if ``run_dir`` is empty, a folder's settings are damaged, or another preset or
             ablation is given whose settings differ.
     """
     if not config.run_dir:
@@ -128,20 +129,33 @@ def with_folders_settings(config: DictConfig) -> DictConfig:
             )
     taken = deepcopy(config)
     taken.run_dir = str(run_dir)  # it may refer to a setting that changes
-    tasks = theirs.pop("tasks", None)
+    _fill(taken, theirs, given, run_dir)
+    if section is not None:
+        study: Any = OmegaConf.to_object(taken[section])
+        folder = run_dir / study.folder
+        if (folder / "config.yaml").exists():
+            _fill(taken, {section: read_settings(folder)}, given, folder)
+    return taken
+
+
+def _fill(
+    config: DictConfig, theirs: Mapping[str, Any], given: Iterable[str], folder: Path
+) -> None:
+    """Fills in a folder's settings, except those that are given or belong to the command."""
+    before = deepcopy(config)
+    tasks = theirs.get("tasks")
     # References in a file are ignored.
     if tasks is not None and "tasks" not in given and "${" not in str(tasks):
-        taken.tasks = tasks
-    for key, value in flat(theirs):
+        config.tasks = tasks
+    for key, value in flat({name: x for name, x in theirs.items() if name != "tasks"}):
         if not _is_any(key, [*given, *OF_THE_COMMAND]) and "${" not in str(value):
             # Settings that no longer exist are skipped; invalid values raise an error later.
             with suppress(OmegaConfBaseException):
                 group = key.rpartition(".")[0]
-                by_task = bool(group) and OmegaConf.get_type(OmegaConf.select(taken, group)) is dict
-                OmegaConf.update(taken, key, value, force_add=by_task)
-    if taken != config:
-        log.info("%s: other settings are read from its config.yaml", run_dir)
-    return taken
+                kind = OmegaConf.get_type(OmegaConf.select(config, group)) if group else None
+                OmegaConf.update(config, key, value, force_add=kind is dict)
+    if config != before:
+        log.info("%s: other settings are read from its config.yaml", folder)
 
 
 def _is_any(key: str, names: Iterable[str]) -> bool:

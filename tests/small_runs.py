@@ -109,6 +109,19 @@ def command_line(recipe: str, *overrides: str) -> int:
     return 0
 
 
+def started(recipes: Any, name: str, *overrides: str) -> tuple[int, list[Any]]:
+    """A recipe's exit code and the settings that it would have run with, and its study's."""
+    ran: list[Any] = []
+
+    def run(config: Any, function: Any, **options: Any) -> None:
+        original(config, lambda run, *study: ran.extend([run.settings, *study]), **options)
+
+    original = recipes.run_recipe
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recipes, "run_recipe", run)
+        return command_line(name, *overrides), ran
+
+
 def contents(folder: Path, *patterns: str) -> dict[str, bytes]:
     return {
         str(path.relative_to(folder)): path.read_bytes()

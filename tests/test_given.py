@@ -19,7 +19,7 @@ pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
 import yaml
-from small_runs import RECIPES, SMALL, command_line, configured, contents, settings_of
+from small_runs import RECIPES, SMALL, command_line, configured, contents, settings_of, started
 
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.pipeline import Run
@@ -37,19 +37,6 @@ def made(recipes: Any, tmp_path: Path) -> Path:
     run = Run(settings_of(*MADE, f"run_dir={folder}"))
     open_run(folder, asdict(run.settings) | {"imitate": {"episodes": 10}})
     return folder
-
-
-def started(recipes: Any, name: str, *overrides: str) -> tuple[int, list[Any]]:
-    """A recipe's exit code and the settings that it would have run with, and its study's."""
-    ran: list[Any] = []
-
-    def run(config: Any, function: Any, **options: Any) -> None:
-        original(config, lambda run, *study: ran.extend([run.settings, *study]), **options)
-
-    original = recipes.run_recipe
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(recipes, "run_recipe", run)
-        return command_line(name, *overrides), ran
 
 
 STUDIES = ("export", "evaluate", "imitate", "interpolate", "latent_sac")

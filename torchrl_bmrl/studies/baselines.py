@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -57,6 +58,7 @@ class BaselineSettings:
 
     algorithms: list[str] = setting(list(BASELINES), choices=BASELINES, unique=True)
     updates: int | None = setting(None, above=0)  # of each; null: as many as a stage-1 agent
+    folder: ClassVar[str] = "baselines"  # of the study, below the run's
 
 
 def baselines(run: Run, settings: BaselineSettings) -> str:
@@ -75,12 +77,13 @@ def baselines(run: Run, settings: BaselineSettings) -> str:
     Raises:
         BMRLError: if demonstrations are missing, a task has no environment, or a training diverges.
     """
+    run.check_open()
     run.check_playable()
     run.statistics  # noqa: B018 (missing demonstrations are found before anything is written)
     stage_1 = run.settings.bcq.epochs * run.settings.bcq.updates_per_epoch
     updates = settings.updates or stage_1
     # More algorithms may join the finished ones, with the same number of updates.
-    open_run(run.folder / "baselines", {"updates": updates})
+    open_run(run.folder / settings.folder, {"updates": updates})
     names = [name for name in BASELINES if name in settings.algorithms]
     trained = [
         (name, task, updates)
@@ -130,7 +133,7 @@ class Learner:
 
     def __init__(self, run: Run, algorithm: str, task: str) -> None:
         self.run, self.algorithm, self.name = run, algorithm, f"{algorithm}-{task}"
-        self.path = run.folder / "baselines" / self.name / "checkpoint.safetensors"
+        self.path = run.folder / BaselineSettings.folder / self.name / "checkpoint.safetensors"
         sizes, bcq = sizes_of(run.transitions(run.names[0], "train")), run.settings.bcq
         torch.manual_seed(run.seed("baselines", self.name))
         if algorithm == ONE_HOT:

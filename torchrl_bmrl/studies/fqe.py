@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -51,6 +51,7 @@ class FQESettings:
     updates: int = setting(3000, above=0)  # of each fitted Q evaluation
     tau: float = setting(0.1, above=0, at_most=1)  # of its target network
     num_candidates: int = setting(10, above=0)  # of the policies that are evaluated
+    folder: ClassVar[str] = "fqe"  # of the study, below the run's
 
 
 def fqe(run: Run, settings: FQESettings) -> str:
@@ -73,9 +74,10 @@ def fqe(run: Run, settings: FQESettings) -> str:
     series = settings.checkpoints
     if len(series) < 2 or series != sorted(series):
         raise ConfigError(f"fqe.checkpoints is {series}; valid: at least two, from low to high")
+    run.check_open()
     run.check_playable()
     run.statistics  # noqa: B018 (missing demonstrations are found before anything is written)
-    open_run(run.folder / "fqe", asdict(settings))
+    open_run(run.folder / settings.folder, asdict(settings))
     run.jobs(
         train_job,
         [(name, series) for name in run.names],
@@ -99,7 +101,7 @@ def fqe(run: Run, settings: FQESettings) -> str:
 
 def _checkpoint(run: Run, name: str, updates: int) -> Path:
     """The agent of a task after a number of updates."""
-    return run.folder / "fqe" / name / f"{updates}.safetensors"
+    return run.folder / FQESettings.folder / name / f"{updates}.safetensors"
 
 
 def _units(run: Run, name: str, settings: FQESettings) -> int:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -56,6 +56,7 @@ class ImitateSettings:
     magnitude: tuple[float, float] = setting((0.5, 1.5), above=0)  # factor of the perturbed motion
     max_angle: float = setting(45.0, at_least=0, at_most=180)  # tilt of its direction [degrees]
     cloning_updates: int = setting(2000, above=0)  # of behaviour cloning on the demonstration
+    folder: ClassVar[str] = "imitation"  # of the study, below the run's
 
 
 Job = tuple[ImitateSettings, str, str, int]
@@ -82,7 +83,7 @@ def imitate(run: Run, settings: ImitateSettings) -> str:
     task = run.composition(settings.composition)
     _check(settings, task)
     run.student()  # a missing policy is an error before anything is written
-    open_run(run.folder / "imitation", asdict(settings))
+    open_run(run.folder / settings.folder, asdict(settings))
     with progress(settings.demonstrations, "demonstrating", "demonstration") as bar:
         for number in range(settings.demonstrations):
             demonstrate(run, task, number)
@@ -102,7 +103,7 @@ def imitate(run: Run, settings: ImitateSettings) -> str:
         unit="step",
     )
     rows = [row for part in results for row in part]
-    write_rows(run.folder / "imitation" / "results.csv", rows)
+    write_rows(run.folder / settings.folder / "results.csv", rows)
     table = make_table(settings, [run.titles[name] for name in task.stages], rows)
     section = Section(heading="One-shot imitation", tables=[table])
     write_study(run.folder, "imitation", section, {})
@@ -139,7 +140,9 @@ def demonstrate(run: Run, task: Task, number: int) -> TensorDictBase:
                 return keep_episode(path, episode)
         raise BMRLError(f"the expert of {task.name} failed from {MAX_ATTEMPTS} starts")
 
-    episode = run.once(f"imitation/demonstration-{number}.npz", read_kept_episode, record)
+    episode = run.once(
+        f"{ImitateSettings.folder}/demonstration-{number}.npz", read_kept_episode, record
+    )
     data = transform_data(as_tensordict(episode), task, run.statistics)
     return data.set("stage", torch.as_tensor(episode.extras["stages"]).long())
 
@@ -147,10 +150,8 @@ def demonstrate(run: Run, task: Task, number: int) -> TensorDictBase:
 def play_job(job: tuple[Run, Job], report: Report) -> list[dict[str, Any]]:
     """The episodes that one demonstration drives with one method and perturbation, played once."""
     run, (settings, method, perturbation, number) = job
-    task, count = (
-        run.composition(settings.composition),
-        settings.episodes // settings.demonstrations,
-    )
+    task = run.composition(settings.composition)
+    count = settings.episodes // settings.demonstrations
 
     def play(path: Path) -> None:
         policy, sources = make_method(run, settings, method, number)
@@ -165,7 +166,7 @@ def play_job(job: tuple[Run, Job], report: Report) -> list[dict[str, Any]]:
         write_rows(path, rows)
 
     name = f"{method}-{perturbation}-{number}".replace(" ", "_").replace(",", "")
-    file = f"imitation/{name}.csv"
+    file = f"{settings.folder}/{name}.csv"
     if (run.folder / file).exists():
         report(count * run.horizon(task))
     return run.once(file, partial(read_rows, columns=_COLUMNS), play)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -68,9 +69,9 @@ class LatentSACSettings:
     eval_episodes: int = setting(10, above=0)
 
     @property
-    def name(self) -> str:
-        """Name of the folder of these agents."""
-        return f"{self.composition}-hold{self.hold}"
+    def folder(self) -> Path:
+        """Folder of these agents, relative to the run's."""
+        return Path("latent_sac", f"{self.composition}-hold{self.hold}")
 
 
 def latent_sac(run: Run, settings: LatentSACSettings) -> str:
@@ -96,7 +97,7 @@ def latent_sac(run: Run, settings: LatentSACSettings) -> str:
         )
     run.composition(settings.composition)
     run.student()  # a missing policy is an error before anything is written
-    folder = run.folder / "latent_sac" / settings.name
+    folder = run.folder / settings.folder
     # Seeds may be added later; all other settings must agree.
     open_run(folder, {name: x for name, x in asdict(settings).items() if name != "seeds"})
     jobs = [(settings, variant, seed) for variant in VARIANTS for seed in settings.seeds]
@@ -113,7 +114,7 @@ def latent_sac(run: Run, settings: LatentSACSettings) -> str:
     for rows in agents:
         curve = np.array([[row["environment_steps"], row["success"]] for row in rows])
         curves.setdefault(rows[0]["variant"], []).append(curve)
-    name = f"latent_sac-{settings.name}"
+    name = "-".join(settings.folder.parts)
     picture = Picture(
         png=success_curves(curves, title=table.title),
         alt="success over the environment's steps, with m and with raw actions",
@@ -127,7 +128,7 @@ def latent_sac(run: Run, settings: LatentSACSettings) -> str:
 def train_job(job: tuple[Run, tuple[LatentSACSettings, str, int]], report: Report) -> list[Row]:
     """Trains the agent of a variant and a seed, or reads it back; one row per evaluation."""
     run, (settings, variant, seed) = job
-    path = run.folder / "latent_sac" / settings.name / f"{variant}-seed{seed}.csv"
+    path = run.folder / settings.folder / f"{variant}-seed{seed}.csv"
     if path.exists():
         rows = read_rows(path, COLUMNS)
         if rows[-1]["environment_steps"] >= settings.environment_steps:

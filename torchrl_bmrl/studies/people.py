@@ -6,7 +6,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -47,6 +47,7 @@ class HumanSettings:
     shares: list[float] = setting([0.0, 0.1, 0.3], at_least=0, at_most=1, unique=True)
     training_seeds: int = setting(2, above=0)  # agents of each share
     tracking: float = setting(1.0, above=0)  # of robosuite's recordings, see docs/data.md
+    folder: ClassVar[str] = "human"  # of the study, below the run's
 
 
 def learn_from_people(run: Run, settings: HumanSettings) -> str:
@@ -65,6 +66,7 @@ def learn_from_people(run: Run, settings: HumanSettings) -> str:
     Raises:
         BMRLError: for demonstrations that cannot be trained on, or if a training diverges.
     """
+    run.check_open()
     if not settings.path:
         raise ConfigError("human.path is empty; valid: a file or folder with demonstrations")
     if settings.task not in run.names:
@@ -72,7 +74,7 @@ def learn_from_people(run: Run, settings: HumanSettings) -> str:
     shares = [0.0, *(share for share in settings.shares if share)]
     agents = [(share, seed) for share in shares for seed in range(settings.training_seeds)]
     bcq, evaluate = run.settings.bcq, run.settings.evaluate
-    folder, tasks = run.folder / "human", run.settings.tasks
+    folder, tasks = run.folder / settings.folder, run.settings.tasks
     if isinstance(tasks, Mapping):
         tasks = {settings.task: tasks[settings.task]}
     else:
