@@ -235,19 +235,21 @@ def test_interpolation_plays_every_method_beside_what_it_is_compared_with(folder
         ({"eef": "hand"}, "no position hand"),
     ],
 )
-def test_interpolation_names_a_setting_that_is_not_valid(
+def test_interpolation_names_a_setting_that_is_not_valid_and_keeps_no_such_setting(
     folder: Path, change: dict[str, Any], says: str
 ) -> None:
     with pytest.raises(ConfigError, match=says):
         study(folder, interpolate, replace(INTERPOLATION, **change))
+    assert not (folder / "interpolation").exists()
 
 
 @pytest.mark.robosuite
 @pytest.mark.slow
 def test_the_columns_of_a_position_are_found_in_the_demonstrations(distilled: Path) -> None:
     run = make_run(distilled)
-    assert interpolation.position_columns(run, "lift", "robot0_eef_pos") == [23, 24, 25]
-    assert interpolation.position_columns(run, "reach", "goal_pos") == [30, 31, 32]
+    for name in ("lift", "reach"):
+        found = interpolation.position_columns(run, INTERPOLATION, name)
+        assert found == {"eef": [23, 24, 25], "cube": [30, 31, 32]}
 
 
 def episodes(*labelled: tuple[str, tuple[float, ...]]) -> dict[str, Any]:

@@ -96,8 +96,10 @@ def interpolate(run: Run, settings: InterpolationSettings) -> str:
             f"{len(names)} tasks"
         )
     embedding = Embedding(run, settings)
-    open_run(run.folder / settings.folder, asdict(settings))
     switching = settings.switching in names and len(embedding.held_out()[0]) > 1
+    for name in [settings.task, *([settings.switching] if switching else [])]:
+        position_columns(run, settings, name)  # an error here leaves no folder
+    open_run(run.folder / settings.folder, asdict(settings))
     jobs = [(settings, name) for name in (*METHODS, *(SWITCHES if switching else ()))]
     results = run.jobs(
         play_job,
@@ -302,7 +304,7 @@ def play(
 ) -> dict[str, np.ndarray]:
     """Plays a task with given m; positions, actions and successes over time, ``(N, T, ...)``."""
     run, settings, task = embedding.run, embedding.settings, embedding.run.task(name)
-    columns = {key: position_columns(run, name, getattr(settings, key)) for key in POSITIONS}
+    columns = position_columns(run, settings, name)
     fixed = torch.from_numpy(embedding.prototypes[name]).float()
     explorer = Explorer(embedding.policy, fixed, noise)
     seeds = [run.seed("interpolate", name, i) for i in range(len(points))]
@@ -318,20 +320,24 @@ def play(
     }
 
 
-def position_columns(run: Run, name: str, part: str) -> list[int]:
-    """Columns of a task's observation that contain a position: those that change with it."""
-    task, raw = run.task(name), _held_out(run, name)[:1].exclude("next")
-    if part in raw.keys():  # noqa: SIM118 (a TensorDict)
-        transform = make_observation_transform(task, parts=run.statistics.parts)
-        moved = raw.copy().set(part, raw[part] + 1)
-        before, after = (transform(data.copy())["observation"] for data in (raw, moved))
-        columns = (after != before).squeeze(0).nonzero().flatten().tolist()
-        if len(columns) == 3:
-            return columns
-    raise ConfigError(
-        f"the observation of task {name} has no position {part}; valid for interpolation.eef and "
-        "interpolation.cube: a part with three coordinates"
-    )
+def position_columns(run: Run, settings: InterpolationSettings, name: str) -> dict[str, list[int]]:
+    """Columns of a task's observation that contain each position: those that change with it."""
+    raw = _held_out(run, name)[:1].exclude("next")
+    transform = make_observation_transform(run.task(name), parts=run.statistics.parts)
+    found = {}
+    for key in POSITIONS:
+        part, columns = getattr(settings, key), []
+        if part in raw.keys():  # noqa: SIM118 (a TensorDict)
+            moved = raw.copy().set(part, raw[part] + 1)
+            before, after = (transform(data.copy())["observation"] for data in (raw, moved))
+            columns = (after != before).squeeze(0).nonzero().flatten().tolist()
+        if len(columns) != 3:
+            raise ConfigError(
+                f"the observation of task {name} has no position {part}; valid for "
+                "interpolation.eef and interpolation.cube: a part with three coordinates"
+            )
+        found[key] = columns
+    return found
 
 
 def _held_out(run: Run, name: str) -> TensorDictBase:
