@@ -58,6 +58,13 @@ def test_groups_of_methods_with_as_many_episodes_hold_the_same_episodes() -> Non
     assert sorted(a) == [1, 1, 1, 1, 2]
 
 
+def test_the_groups_are_drawn_at_random() -> None:
+    first = np.zeros((10, 1, 1))
+    first[:5] = 1.0
+    drawn = {tuple(group_coverage(first, 0.5, group_size=2, seed=seed)) for seed in range(5)}
+    assert len(drawn) > 1
+
+
 def test_spread_is_the_root_of_the_summed_variances() -> None:
     points = RNG.normal(size=(30, 3)) * [1, 2, 3]
     assert spread(points) == pytest.approx(math.sqrt(points.var(axis=0).sum()))

@@ -113,7 +113,7 @@ def test_without_demonstrations_the_error_names_the_recipe_that_writes_them(tmp_
 
 
 def test_the_table_tells_the_agent_that_would_be_chosen() -> None:
-    numbers = {"reach": ([1, 3, 2], [10, 45, 20]), "lift": ([3, 1, 2], [10, 45, 20])}
+    numbers = {"reach": ([1, 3, 2], [10, 45, 20]), "lift": ([13, 11, 12], [110, 145, 120])}
     rows = [
         {"task": task, "updates": updates, "estimate": estimate, "return": value, "success": 0.0}
         for task, parts in numbers.items()
@@ -123,8 +123,8 @@ def test_the_table_tells_the_agent_that_would_be_chosen() -> None:
     found = [(line[0], line[1].split()[0], *line[2:]) for line in table.rows]
     assert found == [
         ("Reach", "1.00", "25.0", "45.0", "20.0", "45.0", "10"),
-        ("Lift", "-1.00", "25.0", "45.0", "20.0", "10.0", "5"),
-        ("All", "0.00", "25.0", "45.0", "20.0", "27.5", ""),
+        ("Lift", "-1.00", "125.0", "145.0", "120.0", "110.0", "5"),
+        ("All", "0.00", "75.0", "95.0", "70.0", "77.5", ""),
     ]
 
 

@@ -167,6 +167,15 @@ def test_a_file_that_was_imported_before_keeps_its_first_units(tmp_path: Path) -
     assert read_original_bounds(tmp_path / "three.hdf5") == (-2.0, 4.0)
 
 
+def test_a_range_that_leaves_the_usual_one_on_either_side_is_the_bounds(tmp_path: Path) -> None:
+    for number, actions in enumerate((-3.0, 3.0)):
+        values = np.linspace(0, actions, 60).reshape(30, 2)
+        path = write_d4rl(tmp_path / f"{number}.hdf5", actions=values)
+        options = ReadOptions(last_step="truncate")
+        ends = values.min(0), values.max(0)
+        assert_allclose(find_action_bounds(path, options=options), ends)
+
+
 def test_bounds_of_other_sizes_are_not_joined() -> None:
     with pytest.raises(ConfigError, match=r"\[2, 3\] dimensions"):
         join_bounds([((0, 0), (1, 1)), ((0, 0, 0), (1, 1, 1))])
@@ -196,6 +205,28 @@ def test_a_mask_that_lost_all_of_its_episodes_is_chosen_anew(tmp_path: Path) -> 
     options = ReadOptions(split="train")
     import_demonstrations(tmp_path / "own.hdf5", tmp_path / "lift.hdf5", options=options)
     assert masks(tmp_path / "lift.hdf5") == {"train": ["demo_0", "demo_1"], "valid": ["demo_2"]}
+
+
+def test_masks_of_one_of_two_files_do_not_decide_what_is_held_out(tmp_path: Path) -> None:
+    write_file(tmp_path / "a.hdf5", (5, 6), train=1)
+    robomimic.write_episodes(
+        tmp_path / "b.hdf5", [make_episode(i) for i in range(2)], env_args=ENV_ARGS
+    )
+    sources = [tmp_path / "a.hdf5", tmp_path / "b.hdf5"]
+    import_demonstrations(sources, tmp_path / "lift.hdf5")
+    assert masks(tmp_path / "lift.hdf5") == {
+        "train": ["demo_0", "demo_1", "demo_2"],
+        "valid": ["demo_3"],
+    }
+
+
+def test_other_masks_of_the_source_stay(tmp_path: Path) -> None:
+    episodes = [make_episode(i) for i in range(3)]
+    robomimic.write_episodes(
+        tmp_path / "own.hdf5", episodes, env_args=ENV_ARGS, masks={"better": [0, 2]}
+    )
+    import_demonstrations(tmp_path / "own.hdf5", tmp_path / "lift.hdf5")
+    assert masks(tmp_path / "lift.hdf5")["better"] == ["demo_0", "demo_2"]
 
 
 # -- what is refused, and what is said -------------------------------------------------------------

@@ -200,6 +200,12 @@ def test_the_order_of_rows_changes_nothing() -> None:
     )
 
 
+def test_resamples_without_a_relative_difference_are_left_out() -> None:
+    # Pairs: both first, -2/3; one of each, 0; both second, a negative mean of y.
+    found = relative_difference([1.0, 1.0], [3.0, -1.0])
+    assert (found.value, found.low, found.high) == pytest.approx((0.0, -2 / 3, 0.0))
+
+
 def test_constant_values_give_no_width() -> None:
     x, y, strata = np.full(41, 90.0), np.full(41, 100.0), pairs()[2]
     found = relative_difference(x, y, strata=strata)
