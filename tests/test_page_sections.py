@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 for extra in ("scipy", "matplotlib", "jinja2", "sklearn"):
@@ -95,3 +96,27 @@ def test_the_page_forbids_the_browser_to_load_anything(page: str) -> None:
         "style-src 'unsafe-inline'",
         "script-src 'unsafe-inline'",
     ]
+
+
+def test_the_explorer_has_the_runs_titles(tmp_path: Path) -> None:
+    pytest.importorskip("h5py")
+    pytest.importorskip("tqdm")
+    from torchrl_bmrl.data import Episode, robomimic
+    from torchrl_bmrl.reports import Embeddings
+    from torchrl_bmrl.reports.films import explore_demonstrations
+
+    parts, zeros = {"x": np.zeros((5, 3))}, np.zeros(1, dtype=int)
+    episode = Episode(
+        observations=parts,
+        next_observations=parts,
+        actions=np.zeros((5, 2)),
+        rewards=np.zeros(5),
+        terminated=np.zeros(5, dtype=bool),
+    )
+    path = tmp_path / "pour.hdf5"
+    robomimic.write_episodes(path, [episode], env_args={}, masks={"valid": [0]})
+    embeddings = Embeddings(
+        tasks=["pour"], task_latent=np.zeros((1, 2)), task=zeros, episode=zeros, step=zeros
+    )
+    explorer = explore_demonstrations(tmp_path, embeddings, titles=TITLES)
+    assert explorer.titles == ["Pouring water"]

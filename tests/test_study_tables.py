@@ -16,7 +16,8 @@ pytest.importorskip("safetensors")
 pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
-from torchrl_bmrl.studies import imitation, interpolation_report, people
+from torchrl_bmrl.evaluation import ResultRow
+from torchrl_bmrl.studies import baselines, imitation, interpolation_report, people
 from torchrl_bmrl.studies.imitation import ImitateSettings
 
 IMITATE = ImitateSettings(
@@ -89,3 +90,14 @@ def test_switching_tells_arriving_from_staying_and_counts_arrivals_before_the_sw
     assert [cell.split()[0] for cell in stay[2:4]] == ["0.67", "0.33"]
     assert list(stay[4:]) == ["1", "0.10", "0.0000"]
     assert switch[-1] == "0.3000"
+
+
+def test_baselines_stand_in_the_runs_order_of_tasks() -> None:
+    rows = [
+        ResultRow(task=task, policy="bc", seed=0, episode=0, episode_return=value, success=True)
+        for task, value in (("lift", 5.0), ("pour", 7.0))
+    ]
+    titles = {"stack": "Stacking", "pour": "Pouring", "lift": "Lifting"}
+    table = baselines.make_table(rows, 10, titles)
+    assert table.header[1:3] == ("Pouring", "Lifting")  # nothing of a task without episodes
+    assert list(table.rows[0][1:3]) == ["7.0, 100%", "5.0, 100%"]
