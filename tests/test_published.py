@@ -15,7 +15,7 @@ for extra in ("scipy", "matplotlib", "jinja2", "sklearn"):
 from published_data import make_curves, make_published, make_rows, make_run
 
 # isort: split
-from published import Published, read_curve_rows, read_published, write_published
+from published import EpisodeRow, Published, read_curve_rows, read_published, write_published
 
 from torchrl_bmrl.errors import DataError
 
@@ -42,6 +42,24 @@ def test_equal_results_are_equal_files_whatever_their_order(tmp_path: Path) -> N
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
     write_published(tmp_path / "b", read_published(tmp_path / "a"))
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
+
+
+def test_the_papers_preset_comes_first_and_runs_without_a_change_before_others(
+    tmp_path: Path,
+) -> None:
+    keys = [("paper", "none", 1), ("paper", "dim4", 0), ("deep", "none", 0), ("deep", "bc", 0)]
+    run = make_run(seed=0)
+    runs = [
+        replace(run, preset=preset, ablation=ablation, seed=seed)
+        for preset, ablation, seed in reversed(keys)
+    ]
+    episodes = [
+        EpisodeRow(preset=preset, ablation=ablation, row=replace(make_rows(seed)[0], seed=seed))
+        for preset, ablation, seed in keys
+    ]
+    write_published(tmp_path, Published(runs=runs, episodes=episodes))
+    read = read_published(tmp_path)
+    assert [run.key for run in read.runs] == [episode.key for episode in read.episodes] == keys
 
 
 def test_a_run_replaces_its_rows_and_no_others() -> None:
