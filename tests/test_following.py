@@ -1,4 +1,4 @@
-"""Calls of a policy with tensors: which dimensions are the batch's."""
+"""Calls of a policy with tensors, and what reaches a live policy before its next call."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ from typing import Any
 
 import pytest
 import torch
+from helpers import make_bcq_loss
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from torchrl_bmrl.modules import PLASPolicy, make_decoder
+from torchrl_bmrl.modules import BCQPolicy, PLASPolicy, make_decoder
 
 
 class FromPicture(nn.Module):
@@ -42,3 +43,13 @@ def test_a_picture_and_an_observation_have_one_batch(
     assert expected.shape == (*batch, 2)
     assert torch.equal(policy(**state), expected)
     assert torch.equal(policy(*(state[key] for key in policy.in_keys)), expected)
+
+
+def test_a_coefficient_that_comes_or_goes_reaches_a_live_policy_at_once() -> None:
+    """A compiled policy does not follow its loss at a call."""
+    loss = make_bcq_loss(latent_clip=0.5)
+    policy = BCQPolicy.live(loss)
+    loss.latent_clip = None
+    assert policy.latent_clip is None
+    loss.latent_clip = 0.25
+    assert float(policy.latent_clip) == 0.25
