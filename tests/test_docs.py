@@ -8,8 +8,9 @@ import re
 import shlex
 import sys
 import types
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 from helpers import NO_UPDATER
@@ -67,6 +68,48 @@ def test_the_page_of_runs_names_every_setting_that_is_free_to_change() -> None:
     _, _, rest = text.partition("You may change ")
     named = re.findall(r"`(\w+)`", rest.partition(".\n")[0])
     assert sorted(named) == sorted(FREE_TO_CHANGE)
+
+
+# -- names in the text -----------------------------------------------------------------------------
+
+QUOTED = [
+    (page, text)
+    for page in [*PAGES, ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs" / "api").glob("*.md"))]
+    for text in re.findall(
+        r"(?<!`)`([^`\n]+)`(?!`)", re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    )
+]
+"""Text between single backticks, outside blocks of code."""
+
+
+def test_files_that_a_page_quotes_exist() -> None:
+    pattern = r"(?:python )?((?:recipes|docs|tests|torchrl_bmrl|\.ci)/[\w./-]*)"
+    found = [(page, found[1]) for page, text in QUOTED if (found := re.match(pattern, text))]
+    assert len(found) > 30
+    missing = [(page.name, path) for page, path in found if not (ROOT / path).exists()]
+    assert not missing
+
+
+def test_settings_that_a_page_quotes_exist(monkeypatch: pytest.MonkeyPatch) -> None:
+    for package in ("hydra", "gymnasium", "h5py", "safetensors", "scipy", "tqdm"):
+        pytest.importorskip(package)
+    monkeypatch.syspath_prepend(str(ROOT / "recipes"))
+    import command
+
+    for recipe in (ROOT / "recipes").glob("*.py"):
+        importlib.import_module(recipe.stem)  # adds the settings of its study
+    kinds = get_type_hints(command.Settings) | command._sections
+    sections = {name: kind for name, kind in kinds.items() if is_dataclass(kind)}
+    found = [
+        (page, section, name)
+        for page, text in QUOTED
+        for section, name in re.findall(r"^(\w+)\.(\w+)(?:=.*)?$", text)
+        if section in sections and name not in ("csv", "html", "py")
+    ]
+    assert len(found) > 30
+    for page, section, name in found:
+        known = {each.name for each in fields(sections[section])}
+        assert name in known, f"{page.name}: {section}.{name}"
 
 
 # -- commands --------------------------------------------------------------------------------------

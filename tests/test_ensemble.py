@@ -35,25 +35,31 @@ def rows(number: int) -> TensorDict:
 
 
 class Scaled(nn.Module):
-    """A network with a number that is neither parameter nor buffer."""
+    """A network with a number, or a tensor, that is neither parameter nor buffer."""
 
-    def __init__(self, network: nn.Module, scale: float) -> None:
+    def __init__(self, network: nn.Module, scale: float | Tensor) -> None:
         super().__init__()
         self.network, self.scale = network, scale
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.scale * self.network(x)
+        scale = self.scale
+        return (scale.mean() if isinstance(scale, Tensor) else scale) * self.network(x)
 
 
 def mixed() -> list[TensorDictModule]:
     return [*modules(8), *modules(8, activation=nn.ReLU)]
 
 
-def scaled() -> list[TensorDictModule]:
+def scaled(*scales: float | Tensor) -> list[TensorDictModule]:
     return [
-        TensorDictModule(Scaled(module.module, 1.0 + i), in_keys=["x"], out_keys=["y"])
-        for i, module in enumerate(modules(8, 8))
+        TensorDictModule(Scaled(module.module, scale), in_keys=["x"], out_keys=["y"])
+        for module, scale in zip(modules(*[8] * len(scales)), scales, strict=True)
     ]
+
+
+def long(middle: float) -> Tensor:
+    """Numbers of which PyTorch prints only the first and the last."""
+    return torch.ones(2000, dtype=torch.float64).index_fill_(0, torch.tensor(1000), middle)
 
 
 @pytest.mark.parametrize("loop", [False, True])
@@ -64,9 +70,10 @@ def scaled() -> list[TensorDictModule]:
         (modules(8), True),
         (modules(8, 4, 8), False),
         (mixed(), False),
-        (scaled(), False),
+        (scaled(1.0, 2.0), False),
+        (scaled(long(1.0), long(9.0)), False),
     ],
-    ids=["equal", "single", "widths", "activations", "attributes"],
+    ids=["equal", "single", "widths", "activations", "numbers", "tensors"],
 )
 def test_module_i_runs_on_row_i(group: list[TensorDictModule], stacked: bool, loop: bool) -> None:
     data = rows(len(group))

@@ -12,7 +12,7 @@ from helpers import NO_UPDATER, make_bcq_loss, transitions
 from tensordict import TensorDict
 from test_loss_contract import CASES, Case, every, every_offline
 from torch import Tensor
-from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
+from torchrl.objectives import HardUpdate, LossModule, SoftUpdate, ValueEstimators
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.objectives import OfflineLoss, StackedLoss
@@ -190,6 +190,31 @@ def test_members_draw_noise_of_their_own(deactivate_vmap: bool) -> None:
     row = CASES["bcq"].batch()
     values, _ = stack.qvalue_loss(torch.stack([row] * 3))
     assert len(set(values.tolist())) == 3
+
+
+def test_members_keep_the_trace_of_their_own_estimator_when_an_option_is_assigned(
+    same_noise: Callable[[int], None],
+) -> None:
+    losses = [make_bcq_loss(dtype=torch.float64) for _ in range(2)]
+    for loss, lmbda in zip(losses, (0.1, 0.95), strict=True):
+        loss.make_value_estimator(ValueEstimators.TDLambda, gamma=0.9, lmbda=lmbda)
+    stack, data = StackedLoss(losses), transitions(3, 5)
+
+    def check() -> None:
+        same_noise(0)
+        within = stack.qvalue_loss(torch.stack([data] * 2))[1]["target_value"]
+        alone = [stack.member(i).qvalue_loss(data)[1]["target_value"] for i in range(2)]
+        torch.testing.assert_close(within, torch.stack(alone))
+
+    check()
+    stack.reduction = "sum"
+    check()
+    stack.gamma = 0.5
+    check()
+    assert [float(stack.member(i).value_estimator.lmbda) for i in range(2)] == [0.1, 0.95]
+    stack.make_value_estimator(ValueEstimators.TDLambda, gamma=0.9, lmbda=0.5)
+    check()
+    assert [float(stack.member(i).value_estimator.lmbda) for i in range(2)] == [0.5, 0.5]
 
 
 @vmap_or_loop

@@ -166,11 +166,8 @@ class BCQPolicy(LossPolicy):
             the action, ``(*B, action_dim)``.
         """
         proposals = _perturb(self, proposals)
-        rows = proposals
-        if (
-            self._flat_rows
-        ):  # with more than two dimensions a BatchNorm takes the second for its features
-            rows = proposals.reshape(-1)
+        # With more than two dimensions a BatchNorm takes the second for its features.
+        rows = proposals.reshape(-1) if self._flat_rows else proposals
         value = self.qvalue_network(rows).get(self.state_action_value_key)
         value = value.reshape(*proposals.batch_size, 1)
         best = value.argmax(dim=-2, keepdim=True)

@@ -178,13 +178,13 @@ class StackedLoss(LossModule):
         """
         for loss in self._all():
             loss.make_value_estimator(value_type, **hyperparams)
-        self._drop_estimators()
+        self._drop_stacked("_value_estimator.")
         return self
 
-    def _drop_estimators(self) -> None:
-        """Removes the stacked buffers of the members' estimators, which are now equal."""
+    def _drop_stacked(self, prefix: str) -> None:
+        """Removes stacked buffers of the members' estimators that are now equal in all members."""
         for name, path in list(self._paths.items()):
-            if path.startswith("_value_estimator."):
+            if path.startswith(prefix):
                 del self._paths[name]
                 delattr(self, name)
 
@@ -206,7 +206,8 @@ class StackedLoss(LossModule):
         if name not in getattr(template, "_coefficients", ()):  # an option, such as reduction
             for loss in self._all():
                 setattr(loss, name, value)
-            self._drop_estimators()
+            if name == "gamma":
+                self._drop_stacked("_value_estimator.gamma")
             return
         each = [value] * len(self)
         if isinstance(value, Tensor) and value.ndim == 1:
