@@ -213,7 +213,12 @@ class Run:
         return load_student(self.student_path)
 
     def once(
-        self, file: str, read: Callable[[Path], Result], make: Callable[[Path], Any]
+        self,
+        file: str,
+        read: Callable[[Path], Result],
+        make: Callable[[Path], Any],
+        *,
+        skipped: Callable[[], Any] = lambda: None,
     ) -> Result:
         """Returns the content of a file, which is written first if it does not exist.
 
@@ -221,10 +226,12 @@ class Run:
             file: path below the run folder.
             read: reads the file.
             make: writes the file atomically.
+            skipped: called if the file exists; reports the work that is not done again.
         """
         path = self.folder / file
         if path.exists():
             log.debug("%s: loaded", path)
+            skipped()
         else:
             make(path)
         return read(path)
