@@ -8,6 +8,8 @@ import multiprocessing
 import os
 import pickle
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -223,6 +225,29 @@ def test_when_a_job_fails_the_others_keep_what_they_did(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="no manifest"):
         run_jobs(work_until_stopped, jobs, workers=2, **OPTIONS)
     assert int((tmp_path / "other").read_text()) >= 1
+
+
+def say_nothing(job: str, report: Report) -> None:
+    print("started", flush=True)
+    time.sleep(600)
+
+
+RUN = f"""
+import sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from test_workers import OPTIONS, run_jobs, say_nothing
+run_jobs(say_nothing, ["a", "b"], workers=2, **OPTIONS)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+def test_workers_end_with_a_parent_that_was_killed() -> None:
+    with subprocess.Popen([sys.executable, "-c", RUN], stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        assert [parent.stdout.readline() for _ in "ab"] == [b"started\n"] * 2
+        parent.kill()
+        assert parent.stdout.read() == b""  # returns when no worker holds the pipe
 
 
 def sleep(job: int, report: Report) -> None:
