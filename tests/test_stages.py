@@ -23,6 +23,8 @@ pytest.importorskip("yaml")
 import torch
 from episode_files import make_episode, write_file
 
+from torchrl_bmrl.data.importing import read_original_bounds
+from torchrl_bmrl.data.robomimic import write_episodes
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
 from torchrl_bmrl.files import read_rows
 from torchrl_bmrl.modules import BCQPolicy, prototype
@@ -87,6 +89,21 @@ def distilled(trained: Path, folder: Path, **settings: Any) -> Run:
     with run:
         stage2(run)
     return run
+
+
+# -- demonstrations --------------------------------------------------------------------------------
+
+
+def test_files_without_an_environment_share_the_bounds_of_all_their_actions(tmp_path: Path) -> None:
+    for name, bound in zip(TASKS, (2.0, 4.0), strict=True):
+        episodes = [make_episode(i, parts=PARTS) for i in range(2)]
+        path = tmp_path / f"{name}.hdf5"
+        write_episodes(path, episodes, env_args={}, bounds=(-bound, bound))
+    run = make(tmp_path)
+    with run:
+        collect(run)
+    for name in TASKS:
+        assert read_original_bounds(run.demonstrations(name)) == (-4.0, 4.0)
 
 
 # -- stage 1 ---------------------------------------------------------------------------------------
