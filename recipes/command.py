@@ -27,7 +27,7 @@ with needs("recipes"):
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.pipeline import Run, Settings
 from torchrl_bmrl.run.command_line import exit_codes
-from torchrl_bmrl.run.folder import deciding, flat, read_settings
+from torchrl_bmrl.run.folder import deciding, flat, other_setting, read_settings
 from torchrl_bmrl.run.logs import log_to_stderr
 from torchrl_bmrl.run.settings import check_settings
 
@@ -123,10 +123,7 @@ def with_folders_settings(config: DictConfig, section: str | None = None) -> Dic
         if name in given and mine[name] != theirs.get(name):
             if deciding(mine) == deciding(theirs):
                 return config
-            raise ConfigError(
-                f"{run_dir}: {name} is {mine[name]} here and {theirs.get(name)} in the folder's "
-                "run; use the same settings to continue, or another run_dir"
-            )
+            raise other_setting(run_dir, name, mine[name], theirs.get(name))
     taken = deepcopy(config)
     taken.run_dir = str(run_dir)  # it may refer to a setting that changes
     _fill(taken, theirs, given, run_dir)

@@ -196,6 +196,15 @@ def test_the_presets_differ_in_what_their_names_say(recipes: Any, tmp_path: Path
     assert configured(f"run_dir={tmp_path}") == configured("preset=quick", f"run_dir={tmp_path}")
 
 
+def test_only_is_refused_by_a_command_that_does_not_split_its_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    assert command_line("distill", "only=[lift]", f"run_dir={folder}") == 1
+    assert "only is ['lift']; valid: null, except with train_bcq.py" in capsys.readouterr().err
+    assert not folder.exists()
+
+
 ABLATIONS = sorted(path.stem for path in (RECIPES / "config" / "ablation").glob("*.yaml"))
 
 

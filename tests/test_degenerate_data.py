@@ -318,6 +318,37 @@ def test_pictures_of_degenerate_embeddings_are_drawn(points: str, dim: int, rows
         embedding_figures.embedding_paths(x, task, titles, {"straight": [x[:2]]}, x[:1])
 
 
+@pytest.mark.parametrize("rows", [1, 3, 4])
+def test_a_report_of_few_transitions_lacks_only_the_map_that_needs_more(
+    tmp_path: Path, rows: int
+) -> None:
+    for package in ("jinja2", "matplotlib", "scipy", "sklearn"):
+        pytest.importorskip(package)
+    from torchrl_bmrl.reports import Embeddings, Explorer, write_report
+
+    step, zeros = np.arange(rows), np.zeros(rows, dtype=int)
+    data = Embeddings(
+        tasks=["reach", "lift"],
+        task_latent=np.stack([step, -(step**2)], axis=1) / rows,
+        task=step % 2,
+        episode=zeros,
+        step=step,
+        distance=1.0 - step / rows,
+        success=step > 0,
+        phase=step // 2,
+        phase_names={"reach": ("descend", "hold"), "lift": ("descend", "hold")},
+        baselines={"raw transition": np.eye(rows, 3)},
+    )
+    names = ("task_latent", "task", "episode", "step", "distance", "success")
+    columns = {name: getattr(data, name) for name in names}
+    explorer = Explorer(titles=["Reach", "Lift"], phase=["hold"] * rows, **columns)
+    page = write_report(tmp_path, facts={}, embeddings=data, training=data, explorer=explorer)
+    drawn = {path.stem for path in (tmp_path / "figures").iterdir()}
+    assert {"embedding", "embedding_trajectories"} <= drawn
+    assert ("embedding_tsne" in drawn) == (rows >= 4)
+    assert ("t-SNE map is left out" in page.read_text(encoding="utf-8")) == (rows < 4)
+
+
 def test_pictures_of_returns_that_are_all_the_same_are_drawn() -> None:
     pytest.importorskip("matplotlib")
     from torchrl_bmrl.reports import figures

@@ -8,6 +8,8 @@ import multiprocessing
 import os
 import pickle
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -162,25 +164,31 @@ def work_until_stopped(job: tuple[str, Path], report: Report) -> None:
     name, folder = job
     done = 0
     try:
+        (folder / f"{name}.pid").write_text(str(os.getpid()))
+        (folder / f"{name}.pid").rename(folder / f"{name}.started")
         while True:
-            (folder / f"{name}.started").touch()
             time.sleep(0.01)
             done += 1
             if name == "fails" and len(list(folder.glob("*.started"))) == 2:
                 raise CheckpointError("runs/lift", "no manifest")
             report(1)
     except StoppedError:
+        time.sleep(0.2)  # a signal that comes meanwhile must not end it
         (folder / name).write_text(str(done))
         raise
 
 
-def signal_when_all_work(folder: Path, names: str, number: signal.Signals) -> threading.Thread:
-    """Signals this process when every job has started."""
+def signal_when_all_work(
+    folder: Path, names: str, number: signal.Signals, *, group: bool
+) -> threading.Thread:
+    """Signals this process when every job has started, and with ``group`` the workers as well."""
 
     def wait() -> None:
-        while not all((folder / f"{name}.started").exists() for name in names):
+        started = [folder / f"{name}.started" for name in names]
+        while not all(file.exists() for file in started):
             time.sleep(0.05)
-        os.kill(os.getpid(), number)
+        for pid in {os.getpid(), *(int(file.read_text()) for file in started if group)}:
+            os.kill(pid, number)
 
     thread = threading.Thread(target=wait)
     thread.start()
@@ -189,15 +197,21 @@ def signal_when_all_work(folder: Path, names: str, number: signal.Signals) -> th
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("workers", "names", "number"),
-    [(1, "a", signal.SIGTERM), (2, "ab", signal.SIGTERM), (2, "ab", signal.SIGINT)],
+    ("workers", "names", "number", "group"),
+    [
+        (1, "a", signal.SIGTERM, False),
+        (2, "ab", signal.SIGTERM, False),
+        (2, "ab", signal.SIGINT, True),  # Ctrl-C
+        (2, "ab", signal.SIGTERM, True),  # a cluster's time limit
+        (2, "ab", signal.SIGHUP, True),  # a closed terminal
+    ],
 )
 def test_asked_to_stop_every_job_keeps_what_it_did(
-    tmp_path: Path, workers: int, names: str, number: signal.Signals
+    tmp_path: Path, workers: int, names: str, number: signal.Signals, group: bool
 ) -> None:
     jobs = [(name, tmp_path) for name in names]
     with stop_on_signals():
-        thread = signal_when_all_work(tmp_path, names, number)
+        thread = signal_when_all_work(tmp_path, names, number, group=group)
         with pytest.raises(StoppedError, match=number.name):
             run_jobs(work_until_stopped, jobs, workers=workers, **OPTIONS)
     thread.join()
@@ -211,6 +225,29 @@ def test_when_a_job_fails_the_others_keep_what_they_did(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="no manifest"):
         run_jobs(work_until_stopped, jobs, workers=2, **OPTIONS)
     assert int((tmp_path / "other").read_text()) >= 1
+
+
+def say_nothing(job: str, report: Report) -> None:
+    print("started", flush=True)
+    time.sleep(600)
+
+
+RUN = f"""
+import sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from test_workers import OPTIONS, run_jobs, say_nothing
+run_jobs(say_nothing, ["a", "b"], workers=2, **OPTIONS)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+def test_workers_end_with_a_parent_that_was_killed() -> None:
+    with subprocess.Popen([sys.executable, "-c", RUN], stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        assert [parent.stdout.readline() for _ in "ab"] == [b"started\n"] * 2
+        parent.kill()
+        assert parent.stdout.read() == b""  # returns when no worker holds the pipe
 
 
 def sleep(job: int, report: Report) -> None:
@@ -236,6 +273,24 @@ def test_a_worker_that_does_not_stop_in_time_is_killed(monkeypatch: pytest.Monke
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+def test_a_second_signal_kills_workers_that_do_not_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "GRACE", 3600.0)
+    reported: list[int] = []
+
+    def update(bar: Any, units: int) -> None:
+        reported.append(units)
+        if len(reported) == 4:
+            signal.raise_signal(signal.SIGTERM)
+            threading.Timer(2.0, os.kill, (os.getpid(), signal.SIGTERM)).start()
+
+    monkeypatch.setattr(workers, "progress", type("Bar", (Lines,), {"update": update}))
+    with stop_on_signals(), pytest.raises(KeyboardInterrupt):
+        run_jobs(sleep, [1, 2], workers=2, **OPTIONS)
+    assert not multiprocessing.active_children()
+
+
 LOG = logging.getLogger("torchrl_bmrl.test_workers")
 
 
@@ -252,8 +307,12 @@ def talk(job: str, report: Report) -> str:
 @pytest.mark.slow
 @pytest.mark.parametrize("level", [logging.DEBUG, logging.INFO, logging.WARNING])
 def test_what_workers_log_reaches_the_handlers_of_this_process_once_and_in_order(
-    caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str], level: int
+    caplog: pytest.LogCaptureFixture,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    level: int,
 ) -> None:
+    monkeypatch.setattr("torchrl_bmrl.run.progress.SOON", 3600.0)  # a busy machine starts slowly
     caplog.set_level(level, "torchrl_bmrl")
     assert run_jobs(talk, ["a", "b", "c"], workers=2, **OPTIONS) == ["a", "b", "c"]
     levels = [x for x in (logging.DEBUG, logging.INFO, logging.WARNING) if x >= level]

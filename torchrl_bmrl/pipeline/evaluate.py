@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from pathlib import Path
 from statistics import fmean
 from typing import Any
 
@@ -108,28 +109,31 @@ def evaluate_once(
         report: called with the number of steps if the episodes are loaded.
     """
     name = "-".join(filter(None, (task, policy, source)))
-    path = run.folder / "evaluation" / f"{name}.csv"
     episodes = run.settings.evaluate.episodes
-    if path.exists():
-        report(episodes * run.horizon(run.task(task)))
-        log.debug("%s: loaded", path)
-        return read_results(path)
-    outcomes = play([run.seed("evaluate", task, i) for i in range(episodes)])
-    rows = [
-        ResultRow(
-            task=task,
-            policy=policy,
-            latent_source=source,
-            seed=run.settings.seed,
-            episode=i,
-            episode_return=outcome.episode_return,
-            success=outcome.success,
-        )
-        for i, outcome in enumerate(outcomes)
-    ]
-    write_results(path, rows)
-    log.debug("%s: mean return %.1f", path, fmean(row.episode_return for row in rows))
-    return rows
+
+    def make(path: Path) -> None:
+        outcomes = play([run.seed("evaluate", task, i) for i in range(episodes)])
+        rows = [
+            ResultRow(
+                task=task,
+                policy=policy,
+                latent_source=source,
+                seed=run.settings.seed,
+                episode=i,
+                episode_return=outcome.episode_return,
+                success=outcome.success,
+            )
+            for i, outcome in enumerate(outcomes)
+        ]
+        write_results(path, rows)
+        log.debug("%s: mean return %.1f", path, fmean(row.episode_return for row in rows))
+
+    return run.once(
+        f"evaluation/{name}.csv",
+        read_results,
+        make,
+        skipped=lambda: report(episodes * run.horizon(run.task(task))),
+    )
 
 
 def evaluate_job(job: tuple[Run, tuple[str, str, str]], report: Report) -> list[ResultRow]:

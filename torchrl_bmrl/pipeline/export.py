@@ -115,7 +115,7 @@ def _write_policy(run: Run, student: Student, metadata: dict[str, Any]) -> None:
         stem=path.stem,
         observation=len(run.statistics.loc),
         latent=student.latent_dim,
-        action=metadata["student"].get("action_dim", 7),
+        action=metadata["student"]["action_dim"],
         draw="N(0, I)" if clip is None else f"N(0, I) and clipped to ±{clip:g}",
         demonstrations=run_facts(run)["Demonstrations"],
         bcq_updates=bcq.epochs * bcq.updates_per_epoch,

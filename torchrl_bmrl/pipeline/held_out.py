@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -84,10 +85,17 @@ def evaluate_held_out(run: Run) -> Table:
 def held_out_job(job: tuple[Run, str], report: Report) -> dict[str, str | float]:
     """Computes the numbers of one task, or loads their file."""
     run, name = job
-    path = run.folder / "evaluation" / f"{name}-held_out.csv"
-    if path.exists():
-        report(2 * _critic_updates(run))
-        return read_rows(path, COLUMNS)[0]
+    (row,) = run.once(
+        f"evaluation/{name}-held_out.csv",
+        partial(read_rows, columns=COLUMNS),
+        lambda path: write_rows(path, [_held_out(run, name, report)]),
+        skipped=lambda: report(2 * _critic_updates(run)),
+    )
+    return row
+
+
+def _held_out(run: Run, name: str, report: Report) -> dict[str, str | float]:
+    """Computes the numbers of one task."""
     valid, index = run.transitions(name, "valid"), run.names.index(name)
     loss, (student, metadata) = run.teacher(name), run.student()
     torch.manual_seed(run.seed("held out", name))
@@ -119,7 +127,7 @@ def held_out_job(job: tuple[Run, str], report: Report) -> dict[str, str | float]
     for key, each, data in (("bcq", teacher, train), ("distilled", policy, with_prototype(train))):
         torch.manual_seed(run.seed("held out", name, "critic"))
         estimates[key] = estimate_return(each, data, where=f"{key} on {name}", **options)
-    row: dict[str, str | float] = {
+    return {
         "task": name,
         "loss_generator": generator.item(),
         "loss_qvalue": qvalue.item(),
@@ -128,8 +136,6 @@ def held_out_job(job: tuple[Run, str], report: Report) -> dict[str, str | float]
         "demonstrated": _discounted_return(train, settings.bcq.gamma),
         **estimates,
     }
-    write_rows(path, [row])
-    return row
 
 
 def _critic_updates(run: Run) -> int:

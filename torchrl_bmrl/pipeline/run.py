@@ -72,7 +72,9 @@ class Run:
         if isinstance(tasks, str):
             tasks = read_task_file(tasks)
         made = make_tasks(tasks)
-        self.tasks = tuple(_with_run_options(task, settings, made) for task in made)
+        if settings.robot and not any("robot" in task.options for task in made):
+            raise ConfigError(f"robot is {settings.robot}; valid for tasks without robosuite: null")
+        self.tasks = tuple(_with_run_options(task, settings) for task in made)
         _check_names(settings, self.names)
         self.folder = Path(settings.run_dir)
         episodes = _train_episodes(settings, self.tasks)
@@ -213,7 +215,12 @@ class Run:
         return load_student(self.student_path)
 
     def once(
-        self, file: str, read: Callable[[Path], Result], make: Callable[[Path], Any]
+        self,
+        file: str,
+        read: Callable[[Path], Result],
+        make: Callable[[Path], Any],
+        *,
+        skipped: Callable[[], Any] = lambda: None,
     ) -> Result:
         """Returns the content of a file, which is written first if it does not exist.
 
@@ -221,10 +228,12 @@ class Run:
             file: path below the run folder.
             read: reads the file.
             make: writes the file atomically.
+            skipped: called if the file exists; reports the work that is not done again.
         """
         path = self.folder / file
         if path.exists():
             log.debug("%s: loaded", path)
+            skipped()
         else:
             make(path)
         return read(path)
@@ -328,10 +337,8 @@ class Run:
         return int(self.transitions(task.name, "train")["step"].max()) + 1
 
 
-def _with_run_options(task: Task, settings: Settings, tasks: Sequence[Task]) -> Task:
+def _with_run_options(task: Task, settings: Settings) -> Task:
     """Returns the task with the run's robot and stepper, if it has these options."""
-    if settings.robot and not any("robot" in each.options for each in tasks):
-        raise ConfigError(f"robot is {settings.robot}; valid for tasks without robosuite: null")
     chosen = {"stepper": settings.stepper, "robot": settings.robot}
     known = {key: x for key, x in chosen.items() if x is not None and key in task.options}
     return task.with_options(**known)

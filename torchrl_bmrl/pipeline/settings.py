@@ -144,8 +144,7 @@ class Settings:
     tasks: Any = None  # names, or a YAML file of tasks; null: the six Sawyer tasks
     robot: str | None = None  # arm of the robosuite tasks; null: the task's own
     only: list[str] | None = None  # tasks of this job of train_bcq.py; other jobs train the rest
-    # Number of processes; no result depends on it.
-    workers: int = field(default_factory=available_cores, metadata=setting(above=0).metadata)
+    workers: int = setting(available_cores, above=0)  # processes; no result depends on their number
     stepper: str = setting("fast", choices=STEPPERS)  # of robosuite; the results are equal
     device: str = "cpu"  # device of training; episodes are played on the CPU
     compile: bool = False  # compile the updates, which takes half a minute

@@ -6,7 +6,6 @@ import logging
 import math
 from contextlib import ExitStack
 from copy import deepcopy
-from dataclasses import fields
 from typing import Any
 
 import torch
@@ -78,10 +77,9 @@ def spread(values: Tensor) -> Tensor:
 
 
 def loss_options(settings: DistillSettings) -> dict[str, Any]:
-    """Returns the options of the distillation loss in the settings."""
+    """Returns the settings that are options of :class:`.MetaDistillationLoss`."""
     others = OF_THE_STUDENT + OF_THE_TRAINING
-    names = [field.name for field in fields(settings) if field.name not in others]
-    return {name: getattr(settings, name) for name in names}
+    return {name: x for name, x in vars(settings).items() if name not in others}
 
 
 def train_student(job: tuple[Run, None], report: Report) -> None:

@@ -27,6 +27,8 @@ with needs("reports"):
 _OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 GREY = "#555555"
 """Colour of what belongs to no task."""
+FEWEST_MAPPED = 4
+"""Number of embeddings that t-SNE needs at least."""
 
 
 def task_colors(count: int) -> tuple[str, ...]:
@@ -86,8 +88,8 @@ def tsne(
         from threadpoolctl import threadpool_limits
 
     count = len(task_latent)
-    if count < 4:
-        raise BMRLError(f"t-SNE needs at least 4 embeddings, got {count}")
+    if count < FEWEST_MAPPED:
+        raise BMRLError(f"t-SNE needs at least {FEWEST_MAPPED} embeddings, got {count}")
     chosen = np.arange(count)
     if count > 3000:
         chosen = np.sort(np.random.default_rng(seed).choice(count, 3000, replace=False))

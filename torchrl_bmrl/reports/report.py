@@ -11,6 +11,7 @@ from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.evaluation.results import Summary, read_results, summarise
 from torchrl_bmrl.files import finite, read_rows, whole, write_atomic
 from torchrl_bmrl.reports import paper
+from torchrl_bmrl.reports.drawing import FEWEST_MAPPED
 from torchrl_bmrl.reports.embedding import (
     EMBEDDING,
     Embeddings,
@@ -307,7 +308,11 @@ def _draw_embeddings(
                 "transition. Compare the paper's figure 4a."
             ),
         ),
-        "embedding_tsne": Picture(
+    }
+    mapped = len(task) >= FEWEST_MAPPED
+    notes = [] if mapped else ["The t-SNE map is left out: there are too few transitions."]
+    if mapped:
+        pictures["embedding_tsne"] = Picture(
             png=embedding_tsne(latent, task, names, seed=seed),
             alt="t-SNE map of task embeddings, one colour per task",
             caption=(
@@ -315,14 +320,13 @@ def _draw_embeddings(
                 "distances: several clusters of one colour suggest stages of that task, such as "
                 "descending, grasping and lifting. Compare the paper's figure 4b."
             ),
-        ),
-    }
+        )
     for name in embeddings.tasks:
         way = embeddings.on_the_way(name)
         if len(way.task) and not np.isnan(way.distance).any():
             break
     else:
-        return pictures, ["The trajectories are left out: no distance to a goal is known."]
+        return pictures, [*notes, "The trajectories are left out: no distance to a goal is known."]
     center = None if training is None else success_point(training, name)
     pictures["embedding_trajectories"] = Picture(
         png=embedding_trajectories(
@@ -342,7 +346,7 @@ def _draw_embeddings(
             "Compare the paper's figure 5 (reach)."
         ),
     )
-    return pictures, []
+    return pictures, notes
 
 
 def _measure_embeddings(
@@ -368,7 +372,7 @@ def _measure_embeddings(
             "The distances are left out: no training demonstration succeeds, or no distance to a "
             "goal is known."
         )
-    for task in (result.task for result in stages if result.transitions >= 4):
+    for task in (result.task for result in stages if result.transitions >= FEWEST_MAPPED):
         way = embeddings.in_stages(task)
         pictures["embedding_stages"] = Picture(
             png=embedding_stages(

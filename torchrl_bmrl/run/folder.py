@@ -105,10 +105,20 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
     before, now = deciding(read_settings(run_dir)), deciding(settings)
     for key in sorted(before | now):
         if before.get(key) != now.get(key):
-            raise ConfigError(
-                f"{run_dir}: {key} is {now.get(key)} here and {before.get(key)} in the folder's "
-                "run; use the same settings to continue, or another run_dir"
-            )
+            raise other_setting(run_dir, key, now.get(key), before.get(key))
+
+
+def other_setting(run_dir: Path, key: str, now: Any, before: Any) -> ConfigError:
+    """Returns the error for a setting that differs from that of the folder's run.
+
+    Example:
+        >>> print(other_setting(Path("runs/mine"), "seed", 1, 0))
+        runs/mine: seed is 1 here and 0 in the folder's run; use the same settings to continue, ...
+    """
+    return ConfigError(
+        f"{run_dir}: {key} is {now} here and {before} in the folder's run; use the same settings "
+        "to continue, or another run_dir"
+    )
 
 
 def deciding(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ _LIMITS = {"above": ("above", gt), "at_least": ("at least", ge), "at_most": ("at
 
 
 def setting(
-    default: Any = dataclasses.MISSING,
+    default: Any,
     *,
     above: float | None = None,
     at_least: float | None = None,
@@ -27,7 +27,7 @@ def setting(
     The limits apply to each value of a list or mapping. ``None`` is valid where the type allows it.
 
     Args:
-        default: the default; lists and dicts are copied for each object.
+        default: the default; lists and dicts are copied for each object, a function is called.
         above: exclusive lower limit.
         at_least: lower limit.
         at_most: upper limit.
@@ -51,7 +51,9 @@ def setting(
         "unique": unique,
     }
     if isinstance(default, list | dict):
-        return dataclasses.field(default_factory=default.copy, metadata=valid)
+        default = default.copy
+    if callable(default):
+        return dataclasses.field(default_factory=default, metadata=valid)
     return dataclasses.field(default=default, metadata=valid)
 
 

@@ -25,6 +25,23 @@ def note_signal(number: int, frame: FrameType | None = None) -> None:
     _asked = signal.Signals(number)
 
 
+def stop_worker_on_signals() -> None:
+    """Makes SIGTERM stop this worker process at its next :func:`check_stop`.
+
+    A terminal or a cluster signals all processes of a run, and the parent process then sends
+    SIGTERM. A repeated SIGTERM is the same request, and only the parent handles the other signals.
+    """
+
+    def note(number: int, frame: FrameType | None = None) -> None:
+        global _asked
+        _asked = signal.Signals(number)
+
+    signal.signal(signal.SIGTERM, note)
+    for name in ("SIGINT", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
+
+
 def check_stop() -> None:
     """Raises an error if a signal was received; called between two units of work.
 

@@ -8,7 +8,6 @@ import logging
 import logging.handlers
 import multiprocessing
 import os
-import signal
 import threading
 import time
 import traceback
@@ -24,7 +23,7 @@ import torch
 from torchrl_bmrl.errors import BMRLError, StoppedError
 from torchrl_bmrl.run.logs import LOGGER
 from torchrl_bmrl.run.progress import Progress, progress
-from torchrl_bmrl.run.stops import check_stop, note_signal
+from torchrl_bmrl.run.stops import check_stop, stop_worker_on_signals
 
 log = logging.getLogger(__name__)
 
@@ -180,8 +179,7 @@ def _serve(connection: Connection, function: Callable[[Job, Report], Result], le
     LOGGER.setLevel(level)
     LOGGER.handlers, LOGGER.propagate = [_SendRecords(connection)], False
     torch.set_num_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
-    signal.signal(signal.SIGTERM, note_signal)
+    stop_worker_on_signals()
     threading.Thread(target=_end_with_parent, daemon=True).start()
     gc.freeze()  # robosuite collects garbage at every env.close(): leave imported modules out
 
@@ -272,10 +270,13 @@ def _run_in_processes(
         for worker in pool:
             worker.end()
         end = time.monotonic() + GRACE
-        for worker in pool:
-            worker.process.join(max(0.0, end - time.monotonic()))
-            worker.process.kill()
-            worker.process.join()
+        try:
+            for worker in pool:
+                worker.process.join(max(0.0, end - time.monotonic()))
+        finally:  # a second signal interrupts the wait
+            for worker in pool:
+                worker.process.kill()
+                worker.process.join()
 
 
 def _death(worker: _Worker) -> str:

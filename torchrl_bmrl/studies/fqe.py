@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
@@ -146,15 +147,23 @@ def train_job(job: tuple[Run, tuple[str, list[int]]], report: Report) -> None:
 
 
 def evaluate_job(job: tuple[Run, tuple[str, int, FQESettings]], report: Report) -> dict[str, Any]:
-    """Estimate and true return of one agent; computed once."""
+    """Computes the estimate and the true return of one agent, or loads their file."""
     run, (name, updates, settings) = job
-    checkpoint = _checkpoint(run, name, updates)
-    path = checkpoint.with_suffix(".csv")
-    if path.exists():
-        report(_units(run, name, settings))
-        return read_rows(path, COLUMNS)[0]
+    (row,) = run.once(
+        f"fqe/{name}/{updates}.csv",
+        partial(read_rows, columns=COLUMNS),
+        lambda path: write_rows(path, [_evaluate(run, name, updates, settings, report)]),
+        skipped=lambda: report(_units(run, name, settings)),
+    )
+    return row
+
+
+def _evaluate(
+    run: Run, name: str, updates: int, settings: FQESettings, report: Report
+) -> dict[str, Any]:
+    """Computes the estimate and the true return of one agent."""
     keep_freed_memory()
-    loss, _ = load_bcq_loss(checkpoint)
+    loss, _ = load_bcq_loss(_checkpoint(run, name, updates))
     policy = BCQPolicy.frozen(loss, num_candidates=settings.num_candidates)
     data, bcq = run.transitions(name, "train"), run.settings.bcq
     # The same for all agents of a task, so that only the policies make their estimates differ.
@@ -175,15 +184,13 @@ def evaluate_job(job: tuple[Run, tuple[str, int, FQESettings]], report: Report) 
     seeds = [run.seed("evaluate", name, i) for i in range(run.settings.evaluate.episodes)]
     outcomes = run.play(run.task(name), policy, seeds=seeds, report=report)
     successes = [outcome.success for outcome in outcomes if outcome.success is not None]
-    row = {
+    return {
         "task": name,
         "updates": updates,
         "estimate": round(estimate, 6),
         "return": round(float(np.mean([outcome.episode_return for outcome in outcomes])), 4),
         "success": round(float(np.mean(successes)), 4) if successes else "",
     }
-    write_rows(path, [row])
-    return row
 
 
 def make_table(rows: Sequence[Mapping[str, Any]], titles: Mapping[str, str]) -> Table:

@@ -166,10 +166,12 @@ def play_job(job: tuple[Run, Job], report: Report) -> list[dict[str, Any]]:
         write_rows(path, rows)
 
     name = f"{method}-{perturbation}-{number}".replace(" ", "_").replace(",", "")
-    file = f"{settings.folder}/{name}.csv"
-    if (run.folder / file).exists():
-        report(count * run.horizon(task))
-    return run.once(file, partial(read_rows, columns=_COLUMNS), play)
+    return run.once(
+        f"{settings.folder}/{name}.csv",
+        partial(read_rows, columns=_COLUMNS),
+        play,
+        skipped=lambda: report(count * run.horizon(task)),
+    )
 
 
 def make_method(

@@ -67,8 +67,8 @@ def make_adam(params: Iterable[Tensor], lr: float) -> Adam:
 def keep_freed_memory() -> bool:
     """Keeps freed memory in the allocator, so that the next update reuses it without page faults.
 
-    By default glibc returns large blocks to the system; allocating them again takes a seventh of an
-    update's time on a CPU at batch 128. The memory of the process never shrinks afterwards.
+    By default glibc returns large blocks to the system. Allocating them again takes a fifth of
+    a BCQ update on one CPU core at batch 128. The memory of the process never shrinks afterwards.
 
     Returns:
         whether the option was set; only glibc has it.
