@@ -3,7 +3,7 @@
 robosuite remains the definition. The loop calls its compiled functions (``opspace_matrices``,
 ``nullspace_torques``, ``orientation_error``). Where robosuite uses plain numpy, the loop does the
 same operations in the same order and calls numpy for matrix products: a different order of
-additions changes the last bit, and contacts turn that into centimetres within a second.
+additions changes the last bit, and contacts can turn that into millimetres (docs/simulator.md).
 """
 
 from __future__ import annotations
