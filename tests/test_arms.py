@@ -17,16 +17,14 @@ from torchrl.envs.utils import check_env_specs
 import torchrl_bmrl.envs  # registers the ids  # noqa: F401
 from torchrl_bmrl.envs.arms import ARMS
 from torchrl_bmrl.envs.robosuite_names import robosuite_metadata
+from torchrl_bmrl.envs.scene import TabletopScene
 from torchrl_bmrl.envs.skills import SKILLS, Push, describe_skill, make_skills
 from torchrl_bmrl.envs.tabletop import TabletopEnv
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.experts.tabletop import compose_tasks
 from torchrl_bmrl.tasks import get_task
 
-pytestmark = [
-    pytest.mark.robosuite,
-    pytest.mark.filterwarnings("ignore:steps are robosuite's own:UserWarning"),
-]
+pytestmark = pytest.mark.robosuite
 
 JOINTS = {"Sawyer": (7, 2), "Panda": (7, 2), "UR5e": (6, 6), "IIWA": (7, 6), "Kinova3": (7, 6)}
 
@@ -67,6 +65,19 @@ def test_an_arm_starts_at_rest_with_an_open_gripper(robot: str) -> None:
         assert scene.gripper.closing
         assert scene.gripper.gap < gap - 0.02
     env.close()
+
+
+def test_the_fingers_at_rest_are_simulated_once_for_each_model() -> None:
+    scene = TabletopScene("lift", robots="Panda", seed=0)
+    gripper = scene.gripper
+    scene.reset()
+    assert scene.gripper is gripper
+    scene.hard_reset = True
+    scene.reset()
+    assert scene.gripper is not gripper
+    assert scene.gripper.model is scene.robots[0].gripper["right"]
+    np.testing.assert_array_equal(scene.gripper.open_fingers, gripper.open_fingers)
+    scene.close()
 
 
 @pytest.mark.parametrize("task", SKILLS)

@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -117,10 +119,18 @@ def test_another_version_of_a_package_is_another_cache(monkeypatch: pytest.Monke
 
 OFFSET = 1.0
 TABLE = np.zeros(3)
+CONSTANTS = ModuleType("constants")
+CONSTANTS.FACTOR = 1.0  # type: ignore[attr-defined]
 
 
-def law(x: float, gain: float = 2.0) -> float:
-    return gain * helper(x) + OFFSET + TABLE[0]
+def law(x: float, gain: float = 2.0, *, shift: float = 0.0) -> float:
+    def inner(x: float) -> float:
+        return x + INNER
+
+    return gain * helper(inner(x)) + OFFSET + TABLE[0] + shift + CONSTANTS.FACTOR
+
+
+INNER = 0.0
 
 
 def helper(x: float) -> float:
@@ -135,12 +145,32 @@ def test_a_fingerprint_sees_code_defaults_constants_and_what_is_called() -> None
         "OFFSET": 1.5,
         "TABLE": np.ones(3),
         "helper": lambda x: x + 2,
+        "INNER": 0.5,
         "law.__defaults__": (3.0,),
+        "law.__kwdefaults__": {"shift": 0.5},
+        "CONSTANTS.FACTOR": 2.0,
     }.items():
         with pytest.MonkeyPatch.context() as patch:
-            if "." in name:
-                patch.setattr(law, "__defaults__", value)
+            owner, _, attribute = name.rpartition(".")
+            if owner:
+                patch.setattr(here[owner], attribute, value)
             else:
                 patch.setitem(here, name, value)
             seen.add(caching.fingerprint(law))
-    assert len(seen) == 5
+    assert len(seen) == 8
+
+
+def test_a_fingerprint_sees_what_a_function_closes_over() -> None:
+    def scaled(factor: float) -> Any:
+        return lambda x: factor * x
+
+    assert caching.fingerprint(scaled(1.0)) == caching.fingerprint(scaled(1.0))
+    assert caching.fingerprint(scaled(1.0)) != caching.fingerprint(scaled(2.0))
+
+
+def test_other_packages_caches_stay_where_they_are() -> None:
+    before = caching.config.CACHE_DIR
+    with caching.user_numba_cache(law):
+        inside = caching.config.CACHE_DIR
+    assert Path(inside).name == caching.fingerprint(law)
+    assert before == caching.config.CACHE_DIR

@@ -16,6 +16,7 @@ from robosuite.controllers import load_composite_controller_config
 
 from torchrl_bmrl.envs import tabletop
 from torchrl_bmrl.envs.lean import without_pictures
+from torchrl_bmrl.envs.obstacles import why_not_fast
 from torchrl_bmrl.envs.scene import TabletopScene
 from torchrl_bmrl.envs.skills import SKILLS
 from torchrl_bmrl.envs.stepper import FastStepper
@@ -173,6 +174,9 @@ COVERED = {
     "absolute poses": {"input_type": "absolute"},
     "the controller evaluates the physics again": {"lite_physics": False},
     "stiffer": {"kp": [100, 200, 300, 100, 200, 300], "damping_ratio": 0.7},
+    "commands beyond the fingers' limits": {
+        "gripper": {"type": "GRIP", "use_action_scaling": False}
+    },
 }
 NOT_COVERED = {
     "JointPositionController": {"type": "JOINT_POSITION", "output_max": 0.05, "output_min": -0.05},
@@ -211,6 +215,44 @@ def test_a_controller_that_is_not_covered_takes_robosuites_step_and_says_so_once
         FastStepper(fast.robosuite_env)
     for env in (fast, reference):
         env.close()
+
+
+CHANGES = {
+    "frame": lambda env, arm: setattr(arm, "input_ref_frame", "world"),
+    "physics": lambda env, arm: setattr(env, "lite_physics", False),
+    "physics of the controller": lambda env, arm: setattr(arm, "lite_physics", False),
+    "stiffness": lambda env, arm: setattr(arm, "kp", arm.kp * 0.5),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_setting_that_changes_within_an_episode_is_followed(name: str) -> None:
+    fast, reference = made_with({})
+    act = random_actions(fast, 0)
+    assert_same_steps(reference, fast, act, 2)
+    before = everything(fast)
+    for env in (fast, reference):
+        scene = env.robosuite_env
+        CHANGES[name](scene, scene.robots[0].composite_controller.part_controllers["right"])
+    assert_same_steps(reference, fast, act, 3)
+    assert not np.array_equal(everything(fast)[0], before[0])
+    assert fast._fast is not None
+    for env in (fast, reference):
+        env.close()
+
+
+def test_an_arm_that_is_no_chain_from_a_fixed_base_is_refused() -> None:
+    scene = TabletopScene("reach")
+    parents = scene.sim.model._model.dof_parentid
+    arm = scene.robots[0].composite_controller.part_controllers["right"]
+    assert why_not_fast(scene) is None
+    parents[arm.qvel_index[3]] = arm.qvel_index[0]  # a joint beside the others
+    obstacle = why_not_fast(scene)
+    assert obstacle is not None
+    assert obstacle.kind == "joints"
+    with pytest.raises(BMRLError, match="not a chain"):
+        FastStepper(scene)
+    scene.close()
 
 
 def test_an_unknown_stepper_is_answered_with_the_valid_ones() -> None:

@@ -156,6 +156,13 @@ def test_a_part_that_never_changes_stays_finite() -> None:
     torch.testing.assert_close(out[:, 30:], torch.zeros(12, 3), atol=1e-3, rtol=0)
 
 
+def test_a_part_that_hardly_changes_is_scaled_up_by_a_thousand_at_most() -> None:
+    data = stack_episodes(random_episodes(2, seed=0), task=0)
+    data["goal_pos"] = 1e-4 * data["goal_pos"]
+    statistics = ObservationStatistics.of([data], [TASK])
+    torch.testing.assert_close(statistics.scale[30:], torch.full((3,), 1e-3), rtol=0, atol=0)
+
+
 @pytest.mark.robosuite
 def test_data_and_environment_give_the_same_observation_for_the_same_episode() -> None:
     pytest.importorskip("robosuite", exc_type=ImportError)

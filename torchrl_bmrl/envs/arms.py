@@ -176,6 +176,6 @@ class Gripper:
         Args:
             geom: MuJoCo's number of the geom.
         """
-        touching = self._env.sim.data._data.contact.geom
-        others = touching[(touching == geom).any(1)]
-        return all(bool(np.isin(others, pads).any()) for pads in self._pads)
+        pairs = self._env.sim.data._data.contact.geom.tolist()
+        touching = {each for pair in pairs if geom in pair for each in pair}
+        return all(not touching.isdisjoint(pads.tolist()) for pads in self._pads)

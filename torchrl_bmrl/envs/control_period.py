@@ -3,7 +3,7 @@
 robosuite remains the definition. The loop calls its compiled functions (``opspace_matrices``,
 ``nullspace_torques``, ``orientation_error``). Where robosuite uses plain numpy, the loop does the
 same operations in the same order and calls numpy for matrix products: a different order of
-additions changes the last bit, and contacts turn that into centimetres within a second.
+additions changes the last bit, and contacts can turn that into millimetres (docs/simulator.md).
 """
 
 from __future__ import annotations
@@ -161,6 +161,22 @@ def _mass_matrix(robot: Robot, mass: np.ndarray) -> None:
 
 
 @cached_njit
+def _velocities(
+    robot: Robot, site: int, buffers: Scratch | Base, velocity: int, angular_velocity: int
+) -> None:
+    # The arguments of the two products refer to the Jacobians in the buffers.
+    _mj_jac_site(
+        robot.model,
+        robot.data,
+        buffers.jacobian_position.ctypes.data,
+        buffers.jacobian_rotation.ctypes.data,
+        site,
+    )
+    _numpy_dot(robot.dot, velocity)
+    _numpy_dot(robot.dot, angular_velocity)
+
+
+@cached_njit
 def control_period(
     substeps: int,
     evaluated: bool,
@@ -189,15 +205,7 @@ def control_period(
             if not robot.arm_lite:
                 _mj_forward(robot.model, robot.data)
         if substep or not seen:
-            _mj_jac_site(
-                robot.model,
-                robot.data,
-                scratch.jacobian_position.ctypes.data,
-                scratch.jacobian_rotation.ctypes.data,
-                robot.site,
-            )
-            _numpy_dot(robot.dot, products.velocity)
-            _numpy_dot(robot.dot, products.angular_velocity)
+            _velocities(robot, robot.site, scratch, products.velocity, products.angular_velocity)
             _mass_matrix(robot, arm.mass)
             arm.position[:] = robot.site_position
             arm.rotation[:] = robot.site_rotation
@@ -208,15 +216,9 @@ def control_period(
             arm.joint_position[:] = robot.qpos[joints]
             arm.joint_velocity[:] = robot.qvel[dofs]
         if base is not None:
-            _mj_jac_site(
-                robot.model,
-                robot.data,
-                base.jacobian_position.ctypes.data,
-                base.jacobian_rotation.ctypes.data,
-                base.site,
+            _velocities(
+                robot, base.site, base, base.velocity_product, base.angular_velocity_product
             )
-            _numpy_dot(robot.dot, base.velocity_product)
-            _numpy_dot(robot.dot, base.angular_velocity_product)
             if base.goal_is_local:
                 _numpy_dot(robot.dot, base.goal_offset_product)
                 _numpy_dot(robot.dot, base.goal_rotation_product)

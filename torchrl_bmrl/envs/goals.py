@@ -1,8 +1,8 @@
 """Goals of an action, as robosuite's controllers set them, with fewer steps in between.
 
 robosuite inverts the frame of the arm's base at every action and computes quaternions that nobody
-reads. For its default settings the goals here are the same bits in a quarter of the time; for all
-others robosuite's own methods are called.
+reads. For its default settings the goals here are the same bits without that; for all others
+robosuite's own methods are called.
 """
 
 from __future__ import annotations

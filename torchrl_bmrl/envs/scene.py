@@ -141,9 +141,7 @@ class TabletopScene(ManipulationEnv):
         model = self.robots[0].robot_model
         model.set_base_xpos(model.base_xpos_offset["table"](TABLE_SIZE[0]))
         arena = TableArena(
-            table_full_size=TABLE_SIZE,
-            table_friction=(1.0, 5e-3, 1e-4),
-            table_offset=TABLE_TOP,
+            table_full_size=TABLE_SIZE, table_friction=(1.0, 5e-3, 1e-4), table_offset=TABLE_TOP
         )
         arena.set_origin([0, 0, 0])
         objects = []
@@ -171,12 +169,15 @@ class TabletopScene(ManipulationEnv):
         marker.set("pos", " ".join(repr(float(x)) for x in position))
         return ET.tostring(root, encoding="unicode")
 
+    def _initialize_sim(self, xml_string: str | None = None) -> None:
+        super()._initialize_sim(xml_string)
+        self._gripper: Gripper | None = None  # simulated once for each model, not at each reset
+
     def _setup_references(self) -> None:
         super()._setup_references()
         self._goal_site_id = self.sim.model.site_name2id("goal_marker")
         self._eef_site_id = self.robots[0].eef_site_id["right"]
         self._eef_body_id = self.sim.model.body_name2id(self.robots[0].gripper["right"].root_body)
-        self._gripper: Gripper | None = None
         if self.has_cube:
             self._cube_body_id = self.sim.model.body_name2id(self.cube.root_body)
             self._cube_dof = self.sim.model.get_joint_qvel_addr(self.cube.joints[0])[0]
@@ -275,8 +276,7 @@ class TabletopScene(ManipulationEnv):
         return self.skill_success()
 
     def _post_action(self, action: np.ndarray) -> tuple[float, bool, dict[str, Any]]:
-        # Poses lag the joints by one physics substep; the observation must be a function of the
-        # state.
+        # Poses lag the joints by one substep; the observation must be a function of the state.
         mujoco.mj_fwdPosition(self.sim.model._model, self.sim.data._data)
         self.update_stage()
         return super()._post_action(action)

@@ -23,9 +23,16 @@ with needs("robosuite"):
 
 def take_shortcuts(env: MujocoEnv) -> None:
     """Replaces the slow methods of one environment whose class takes them from robosuite."""
-    for name, (stock, faster) in _SHORTCUTS.items():
+    contacts = _Contacts(env)
+    shortcuts: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
+        "check_contact": (MujocoEnv.check_contact, contacts.check_contact),
+        "_check_grasp": (ManipulationEnv._check_grasp, contacts.check_grasp),
+        "_gripper_to_target": (ManipulationEnv._gripper_to_target, contacts.gripper_to_target),
+        "_get_wipe_information": (Wipe._get_wipe_information, _WipeInformation(env)),
+    }
+    for name, (stock, faster) in shortcuts.items():
         if name not in vars(env) and getattr(type(env), name, None) is stock:
-            setattr(env, name, faster(env))
+            setattr(env, name, faster)
 
 
 class _Contacts:
@@ -33,7 +40,7 @@ class _Contacts:
 
     def __init__(self, env: MujocoEnv) -> None:
         self.env = env
-        self.grippers: dict[int, tuple[GripperModel, list[set[str]], str]] = {}
+        self.gripper: GripperModel | None = None  # the last that was looked at
 
     def check_contact(self, geoms_1: Any, geoms_2: Any = None) -> bool:
         """As ``MujocoEnv.check_contact``."""
@@ -54,9 +61,9 @@ class _Contacts:
         model = _only_gripper(gripper)
         if model is None:
             return ManipulationEnv._check_grasp(self.env, gripper, object_geoms)
-        _, pads, _ = self._known(model)
+        self._look_at(model)
         names = _names(object_geoms)
-        return all(self.env.check_contact(pad, names) for pad in pads)
+        return all(self.env.check_contact(pad, names) for pad in self.pads)
 
     def gripper_to_target(
         self, gripper: Any, target: Any, target_type: str = "body", return_distance: bool = False
@@ -67,20 +74,20 @@ class _Contacts:
             return ManipulationEnv._gripper_to_target(
                 self.env, gripper, target, target_type, return_distance
             )
+        self._look_at(model)
         data = self.env.sim.data
         find = {"body": data.get_body_xpos, "site": data.get_site_xpos}
         position = find.get(target_type, data.get_geom_xpos)(target)
-        difference = position - data.get_site_xpos(self._known(model)[2])
+        difference = position - data.get_site_xpos(self.site)
         return np.linalg.norm(difference) if return_distance else difference
 
-    def _known(self, model: GripperModel) -> tuple[GripperModel, list[set[str]], str]:
+    def _look_at(self, model: GripperModel) -> None:
         # robosuite puts all names of a gripper together anew at each look.
-        if id(model) not in self.grippers:
+        if self.gripper is not model:
             geoms = model.important_geoms
-            pads = [_names(geoms[f"{side}_fingerpad"]) for side in ("left", "right")]
-            known = model, pads, model.important_sites["grip_site"]
-            self.grippers = {id(model): known}
-        return self.grippers[id(model)]
+            self.pads = [_names(geoms[f"{side}_fingerpad"]) for side in ("left", "right")]
+            self.site = model.important_sites["grip_site"]
+            self.gripper = model
 
 
 def _only_gripper(gripper: Any) -> GripperModel | None:
@@ -125,14 +132,3 @@ class _WipeInformation:
             if left:
                 radius = np.max(np.linalg.norm(positions - centroid, axis=1))
         return radius, centroid, mean
-
-
-_SHORTCUTS: dict[str, tuple[Callable[..., Any], Callable[[Any], Callable[..., Any]]]] = {
-    "check_contact": (MujocoEnv.check_contact, lambda env: _Contacts(env).check_contact),
-    "_check_grasp": (ManipulationEnv._check_grasp, lambda env: _Contacts(env).check_grasp),
-    "_gripper_to_target": (
-        ManipulationEnv._gripper_to_target,
-        lambda env: _Contacts(env).gripper_to_target,
-    ),
-    "_get_wipe_information": (Wipe._get_wipe_information, _WipeInformation),
-}
