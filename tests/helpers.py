@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
@@ -20,6 +21,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
+from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.generators import Autoencoder
 from torchrl_bmrl.modules import (
     ActionVAE,
@@ -37,6 +39,7 @@ from torchrl_bmrl.objectives import (
     FQELoss,
     MetaDistillationLoss,
     PLASLoss,
+    StackedLoss,
 )
 from torchrl_bmrl.testing import Case, discrete_transitions, transitions
 from torchrl_bmrl.testing.measures import as_keywords as as_keywords
@@ -46,6 +49,7 @@ from torchrl_bmrl.testing.measures import state as state
 from torchrl_bmrl.testing.measures import total as total
 
 OBSERVATION_DIM, ACTION_DIM, LATENT_DIM, TASK_LATENT_DIM = 3, 2, 4, 2
+DIMS = (OBSERVATION_DIM, ACTION_DIM)
 NUM_ACTIONS = 3
 CELLS = (8,)
 NO_UPDATER = "ignore:No target network updater"
@@ -57,6 +61,18 @@ def task_transitions(num_tasks: int, rows: int, dtype: torch.dtype = torch.float
     data["task"] = torch.arange(num_tasks).unsqueeze(-1).expand(num_tasks, rows).clone()
     data["previous"] = transitions(num_tasks, rows, dtype=dtype, seed=1)
     return data
+
+
+def refused(message: str) -> Any:
+    """Expects the library's error with a message that matches."""
+    return pytest.raises(BMRLError, match=message)
+
+
+def observations(*batch: int) -> TensorDict:
+    """Random observations, the same at every call."""
+    generator = torch.Generator().manual_seed(0)
+    observation = torch.randn(*batch, OBSERVATION_DIM, generator=generator)
+    return TensorDict({"observation": observation}, batch_size=batch)
 
 
 # -- losses, small, as cases of the contract ------------------------------------------------------
@@ -72,6 +88,8 @@ STUDENT = {
     "latent_norm": {M},
 }
 BOUNDS = {"bounds": (-1.0, 1.0)}
+CRITIC_KEYS = {"in_keys": ["observation", "action"], "out_keys": ["state_action_value"]}
+"""The keys of a critic that a test writes itself."""
 
 
 def undeclared(module: Any) -> Any:
@@ -89,20 +107,18 @@ def undeclare(name: str, network: Any) -> Any:
 
 def make_generator(dtype: torch.dtype = torch.float64) -> ActionVAE:
     """A small variational autoencoder."""
-    return ActionVAE(OBSERVATION_DIM, ACTION_DIM, num_cells=CELLS).to(dtype)
+    return ActionVAE(*DIMS, num_cells=CELLS).to(dtype)
 
 
 def make_critics(number: int, dtype: torch.dtype = torch.float64) -> list[TensorDictModule]:
     """Small critics of continuous actions."""
-    dims = (OBSERVATION_DIM, ACTION_DIM)
-    return [make_qvalue_network(*dims, num_cells=CELLS).to(dtype) for _ in range(number)]
+    return [make_qvalue_network(*DIMS, num_cells=CELLS).to(dtype) for _ in range(number)]
 
 
 def bcq_networks(perturbation: bool) -> dict[str, Any]:
-    dims = (OBSERVATION_DIM, ACTION_DIM)
     networks: dict[str, Any] = {"generator": make_generator(), Q: make_critics(1)[0]}
     if perturbation:
-        networks[XI] = make_perturbation_network(*dims, num_cells=CELLS)
+        networks[XI] = make_perturbation_network(*DIMS, num_cells=CELLS)
     return networks
 
 
@@ -115,6 +131,12 @@ def bcq_case(perturbation: bool = False) -> Case:
 def make_bcq_loss(*, perturbation: bool = False, **options: Any) -> BCQLoss:
     """A small loss whose target networks differ from the trained ones."""
     return bcq_case(perturbation).make(**options)
+
+
+def stack_of_bcq(number: int = 2) -> tuple[StackedLoss, TensorDict]:
+    """A stack of losses with seeds 0, 1, ..., and a batch of other transitions for each."""
+    losses = [make_bcq_loss(seed=seed) for seed in range(number)]
+    return StackedLoss(losses), torch.stack([transitions(8, seed=seed) for seed in range(number)])
 
 
 def plas_networks(perturbation: bool) -> dict[str, Any]:
@@ -158,7 +180,7 @@ def make_policy(
     dtype: torch.dtype, in_key: NestedKey = "observation", out_key: NestedKey = "action"
 ) -> TensorDictModule:
     """A small deterministic policy."""
-    network = nn.Sequential(make_mlp(OBSERVATION_DIM, ACTION_DIM, CELLS), nn.Tanh()).to(dtype)
+    network = nn.Sequential(make_mlp(*DIMS, CELLS), nn.Tanh()).to(dtype)
     return TensorDictModule(network, in_keys=[in_key], out_keys=[out_key])
 
 
@@ -183,12 +205,11 @@ def make_fqe_loss(**options: Any) -> FQELoss:
 
 def make_student_networks(num_tasks: int, dtype: torch.dtype) -> list[TensorDictModule]:
     """Encoder, classifier, generator and critic of a student."""
-    dims = (OBSERVATION_DIM, ACTION_DIM)
     networks = [
-        make_task_encoder(*dims, TASK_LATENT_DIM, num_cells=CELLS),
+        make_task_encoder(*DIMS, TASK_LATENT_DIM, num_cells=CELLS),
         make_task_classifier(num_tasks, TASK_LATENT_DIM),
-        make_decoder(*dims, LATENT_DIM, task_latent_dim=TASK_LATENT_DIM, num_cells=CELLS),
-        make_qvalue_network(*dims, task_latent_dim=TASK_LATENT_DIM, num_cells=CELLS),
+        make_decoder(*DIMS, LATENT_DIM, task_latent_dim=TASK_LATENT_DIM, num_cells=CELLS),
+        make_qvalue_network(*DIMS, task_latent_dim=TASK_LATENT_DIM, num_cells=CELLS),
     ]
     return [network.to(dtype) for network in networks]
 
@@ -197,10 +218,9 @@ def make_teachers(
     num_tasks: int, dtype: torch.dtype = torch.float64
 ) -> tuple[list[TensorDictModule], list[TensorDictModule]]:
     """One decoder and one critic per task."""
-    dims = (OBSERVATION_DIM, ACTION_DIM)
     return (
-        [make_decoder(*dims, LATENT_DIM, num_cells=CELLS).to(dtype) for _ in range(num_tasks)],
-        [make_qvalue_network(*dims, num_cells=CELLS).to(dtype) for _ in range(num_tasks)],
+        [make_decoder(*DIMS, LATENT_DIM, num_cells=CELLS).to(dtype) for _ in range(num_tasks)],
+        [make_qvalue_network(*DIMS, num_cells=CELLS).to(dtype) for _ in range(num_tasks)],
     )
 
 
