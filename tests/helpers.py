@@ -51,11 +51,14 @@ from torchrl_bmrl.testing.measures import total as total
 OBSERVATION_DIM, ACTION_DIM, LATENT_DIM, TASK_LATENT_DIM = 3, 2, 4, 2
 DIMS = (OBSERVATION_DIM, ACTION_DIM)
 NUM_ACTIONS = 3
+TASKS, ROWS = 3, 5
 CELLS = (8,)
 NO_UPDATER = "ignore:No target network updater"
 
 
-def task_transitions(num_tasks: int, rows: int, dtype: torch.dtype = torch.float64) -> TensorDict:
+def task_transitions(
+    num_tasks: int = TASKS, rows: int = ROWS, dtype: torch.dtype = torch.float64
+) -> TensorDict:
     """Random transitions of several tasks, each with the one before it."""
     data = transitions(num_tasks, rows, dtype=dtype)
     data["task"] = torch.arange(num_tasks).unsqueeze(-1).expand(num_tasks, rows).clone()
@@ -224,7 +227,7 @@ def make_teachers(
     )
 
 
-def distillation_networks(num_tasks: int = 3, teachers: Any = None) -> dict[str, Any]:
+def distillation_networks(num_tasks: int = TASKS, teachers: Any = None) -> dict[str, Any]:
     student = make_student_networks(num_tasks, torch.float64)
     names = (M, "task_classifier", G, "student_qvalue_network")
     generators, critics = teachers or make_teachers(num_tasks)
@@ -235,7 +238,7 @@ def distillation_networks(num_tasks: int = 3, teachers: Any = None) -> dict[str,
 def distillation_case(
     trains: dict[str, set[str]] = STUDENT,
     *,
-    num_tasks: int = 3,
+    num_tasks: int = TASKS,
     teachers: Any = None,
     **options: Any,
 ) -> Case:
@@ -245,14 +248,14 @@ def distillation_case(
         trains,
         options={"latent_dim": LATENT_DIM, "context": "current", **options},
         data=task_transitions,
-        shape=(3, 5),
+        shape=(TASKS, ROWS),
         need_not_fall=("latent_norm",),  # the penalty on m pays for the other terms
         mixes_rows=options.get("context") in ("random", "set"),
     )
 
 
 def make_distillation_loss(
-    *, num_tasks: int = 3, teachers: Any = None, **options: Any
+    *, num_tasks: int = TASKS, teachers: Any = None, **options: Any
 ) -> MetaDistillationLoss:
     """A small loss with teachers of its own."""
     return distillation_case(num_tasks=num_tasks, teachers=teachers).make(**options)
