@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -51,6 +52,14 @@ def test_a_nested_state_comes_back_bit_by_bit(path: Path) -> None:
     assert metadata == META
 
 
+def training_state(net: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
+    return {
+        "net": net.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "rng": torch.get_rng_state(),
+    }
+
+
 def train(net: nn.Module, optimizer: torch.optim.Optimizer, updates: int) -> None:
     for _ in range(updates):
         optimizer.zero_grad()
@@ -63,11 +72,7 @@ def test_module_optimizer_and_random_state_come_back_bit_by_bit(path: Path) -> N
     net = network()
     optimizer = torch.optim.Adam(net.parameters(), lr=0.01, amsgrad=True)
     train(net, optimizer, 3)
-    state = {
-        "net": net.state_dict(),
-        "optimizer": optimizer.state_dict(),
-        "rng": torch.get_rng_state(),
-    }
+    state = training_state(net, optimizer)
     save_checkpoint(path, state, META)
     loaded, _ = load_checkpoint(path, kind="example")
     assert same({**state, "net": dict(state["net"])}, loaded)
@@ -87,12 +92,7 @@ def test_five_updates_and_five_more_equal_ten(path: Path) -> None:
 
     net, optimizer = fresh()
     train(net, optimizer, 5)
-    state = {
-        "net": net.state_dict(),
-        "optimizer": optimizer.state_dict(),
-        "rng": torch.get_rng_state(),
-    }
-    save_checkpoint(path, state, META)
+    save_checkpoint(path, training_state(net, optimizer), META)
 
     torch.manual_seed(99)
     net = network()

@@ -173,7 +173,7 @@ def test_isometry_error_compares_distances_within_a_task_alone() -> None:
     )
     data = task_transitions()
     found = run(loss, data)["loss_isometry"]
-    m = loss._encode(data).detach()
+    m = encode(loss, data).detach()
     for task, generator in enumerate(teachers[0]):
         asked = data[task].select("observation")
         asked["action_latent"] = torch.zeros(*asked.batch_size, LATENT_DIM, dtype=m.dtype)

@@ -8,6 +8,7 @@ import torch
 from helpers import (
     ACTION_DIM,
     CELLS,
+    CRITIC_KEYS,
     DIMS,
     LATENT_DIM,
     NO_UPDATER,
@@ -17,6 +18,8 @@ from helpers import (
     numpy_mlp,
     observations,
     recorded,
+    state,
+    total,
     transitions,
     undeclare,
     undeclared,
@@ -51,11 +54,7 @@ class Near(nn.Module):
 
 
 def near(point: float = 0.0) -> TensorDictModule:
-    return TensorDictModule(
-        Near(torch.full((ACTION_DIM,), point)),
-        in_keys=["observation", "action"],
-        out_keys=["state_action_value"],
-    )
+    return TensorDictModule(Near(torch.full((ACTION_DIM,), point)), **CRITIC_KEYS)
 
 
 # -- candidates ------------------------------------------------------------------------------------
@@ -188,15 +187,14 @@ def test_policy_of_a_loss_acts_with_its_networks_and_first_critic(
 @pytest.mark.filterwarnings(NO_UPDATER)
 def test_policy_of_a_loss_is_a_copy() -> None:
     loss = make_bcq_loss(perturbation=True)
-    before = {key: value.clone() for key, value in loss.state_dict().items()}
+    before = state(loss)
     policy = BCQPolicy.frozen(loss)
     assert not any(parameter.requires_grad for parameter in policy.parameters())
     assert all(parameter.requires_grad for parameter in loss.parameters())
     data = transitions(6).select("observation")
     torch.manual_seed(0)
     action = policy(data)["action"].clone()
-    losses = loss(transitions(8))
-    sum(losses[key] for key in losses.keys() if key.startswith("loss_")).backward()  # noqa: SIM118
+    total(loss(transitions(8))).backward()
     torch.optim.SGD(loss.parameters(), lr=10.0).step()
     torch.manual_seed(0)
     assert torch.equal(policy(data)["action"], action)
@@ -254,7 +252,10 @@ def test_a_policy_reads_what_its_networks_read_and_writes_the_action(kind: str) 
         policy = PLASPolicy.frozen(PLASLoss(generator, actor, critic, bounds=(-1.0, 1.0)))
         entries["goal"] = torch.randn(6, 6)
     assert set(policy.in_keys) == set(entries)
-    assert act(policy, **entries).shape == (6, ACTION_DIM)
+    assert policy.out_keys == ["action"]
+    written = policy(TensorDict(entries, [6]))
+    assert set(written.keys()) == {*entries, "action"}
+    assert written["action"].shape == (6, ACTION_DIM)
 
 
 class Scaled(nn.Module):
@@ -274,4 +275,9 @@ def test_a_policy_acts_on_bytes() -> None:
         module.module = Scaled(module.module)
     policy = BCQPolicy(generator.decoder, critic, latent_dim=LATENT_DIM, num_candidates=5)
     pixels = torch.randint(256, (6, OBSERVATION_DIM), dtype=torch.uint8)
-    assert act(policy, observation=pixels).shape == (6, ACTION_DIM)
+    actions = []
+    for observation in (pixels, pixels.float()):
+        torch.manual_seed(0)
+        actions.append(act(policy, observation=observation))
+    assert actions[0].shape == (6, ACTION_DIM)
+    assert torch.equal(*actions)

@@ -47,7 +47,6 @@ pytestmark = pytest.mark.filterwarnings(NO_UPDATER)
 
 # -- BCQ -------------------------------------------------------------------------------------------
 
-
 GENERATIVE = {
     "gamma": 0.97,
     "lmbda": 0.75,
@@ -141,7 +140,6 @@ def test_a_slightly_different_bcq_does_not_agree(wrong: dict[str, Any]) -> None:
 
 # -- PLAS ------------------------------------------------------------------------------------------
 
-
 PLAS_VARIANTS = [
     {},
     {"perturbation": True},
@@ -208,7 +206,6 @@ def test_a_slightly_different_plas_does_not_agree(wrong: dict[str, Any]) -> None
 
 
 # -- discrete BCQ ----------------------------------------------------------------------------------
-
 
 DISCRETE = {"gamma": 0.97, "threshold": 0.3, "logits_weight": 0.01, "loss_function": "smooth_l1"}
 DISCRETE_VARIANTS = [

@@ -99,13 +99,12 @@ def test_the_sampler_has_all_that_torchrl_asks_for() -> None:
 
 # -- rows of the data ------------------------------------------------------------------------------
 
-
 INDICES = {
     "one": torch.tensor(4),
     "none": torch.zeros(0, dtype=torch.int64),
     "rows": torch.tensor([[3, 3, 0], [46, 1, 2]]),
     "narrow": torch.tensor([3, 1], dtype=torch.int32),
-    "from the end": torch.tensor([-1, 0]),
+    "from the end": torch.tensor([-1, 0, -47]),
     "mask": torch.arange(47) > 40,
     "slice": slice(2, 5),
 }
@@ -116,12 +115,6 @@ def test_a_buffer_is_indexed_as_its_data_are(index: Any) -> None:
     expected, got = torch.cat(tasks())[index], multi_task()[index]
     assert got.batch_size == expected.batch_size
     assert (got == expected).all()
-
-
-def test_rows_are_found_from_the_end_too() -> None:
-    buffer = single()
-    index = torch.tensor([-1, 0, -50])
-    assert buffer[index]["number"].tolist() == buffer[:]["number"][index].tolist()
 
 
 @every_buffer

@@ -34,6 +34,7 @@ def sources(encoder: TensorDictModule) -> dict[str, Transform]:
         "online": OnlineTaskLatent(POINT, encoder),
         "time": DemonstrationTaskLatent(demonstration(), encoder),
         "state": DemonstrationTaskLatent(demonstration(), encoder, alignment="state"),
+        "progress": DemonstrationTaskLatent(demonstration(), encoder, alignment="progress"),
     }
 
 
@@ -145,7 +146,6 @@ def test_the_stage_chooses_among_points() -> None:
 
 
 # -- paths -----------------------------------------------------------------------------------------
-
 
 PATHS = torch.arange(24.0).reshape(2, 4, 3)[..., :TASK_LATENT_DIM]
 """A path of four points for each of two environments."""
