@@ -78,7 +78,7 @@ def observations(*batch: int) -> TensorDict:
     return TensorDict({"observation": observation}, batch_size=batch)
 
 
-# -- losses, small, as cases of the contract ------------------------------------------------------
+# -- losses, small, as cases of the contract -------------------------------------------------------
 
 Q, XI, M, G = "qvalue_network", "perturbation_network", "task_encoder", "student_generator"
 ACTOR = "actor_network"
@@ -96,7 +96,7 @@ CRITIC_KEYS = {"in_keys": ["observation", "action"], "out_keys": ["state_action_
 
 
 def undeclared(module: Any) -> Any:
-    """The network as a user writes it: it says neither its sizes nor its bounds."""
+    """The network as a user writes it, without its sizes and bounds."""
     if isinstance(module, ActionVAE):
         parts = undeclared(module.encoder), undeclared(module.decoder)
         return Autoencoder(*parts, module.latent_dim)
@@ -188,7 +188,7 @@ def make_policy(
 
 
 def evaluate_a_policy(qvalue_network: Any, policy: Any = None, **options: Any) -> FQELoss:
-    """The loss with a policy under the keys of the critics: it is trained by nobody."""
+    """A loss whose policy reads and writes the critics' keys and is not trained."""
     if policy is None:
         several = isinstance(qvalue_network, list)
         first = next(iter(qvalue_network), None) if several else qvalue_network
@@ -271,7 +271,7 @@ def guide(name: str = "extending") -> ModuleType:
     return sys.modules[name]
 
 
-# -- networks, watched and repeated ----------------------------------------------------------------
+# -- networks, recorded and recomputed -------------------------------------------------------------
 
 
 def recorded(module: nn.Module) -> list[tuple[tuple[Tensor, ...], Tensor]]:

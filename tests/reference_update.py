@@ -22,7 +22,7 @@ Differences = dict[str, float]
 Record = Callable[[str, object], None]
 
 
-# -- networks: one hidden tanh layer, no kink for a finite difference to meet ----------------------
+# -- networks: one hidden tanh layer, which is smooth for finite differences -----------------------
 
 
 class Network(nn.Module):
@@ -85,7 +85,7 @@ def make_perturbation_network() -> TensorDictModule:
     return module(network, ["observation", "action"], "perturbation")
 
 
-# Both bounds cut some actions, so the clipping has its share in values and gradients.
+# Both bounds clip some actions, so that the clipping affects values and gradients.
 BOUNDS = (torch.tensor([-0.4, -0.7]).double(), torch.tensor([0.5, 0.6]).double())
 
 
@@ -130,7 +130,7 @@ def draws(**shapes: tuple[int, ...]) -> dict[str, np.ndarray]:
 def snapshot(
     loss: LossModule, read: Callable[[Tensor], Tensor] = lambda leaf: leaf.detach()
 ) -> dict[str, np.ndarray]:
-    """Copies of what is read of every weight, under the reference's names."""
+    """Copies of ``read(weight)`` for every weight, under the reference's names."""
     state = {}
     for child, params in loss.named_children():
         if not isinstance(params, TensorDictParams):
@@ -206,7 +206,7 @@ def differences(
 
 
 def report(name: str, found: Differences, record_property: Record) -> None:
-    """Notes the differences, which ``pytest -s`` shows, and holds them to the tolerance."""
+    """Records and prints the differences, and asserts that they are within the tolerance."""
     for kind, value in found.items():
         record_property(f"{name} {kind}", value)
     each = ", ".join(f"{kind} {value:.0e}" for kind, value in found.items())

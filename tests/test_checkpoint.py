@@ -116,7 +116,7 @@ def test_a_second_save_replaces_the_first(path: Path) -> None:
 
 
 def steps(path: Path) -> dict[str, int]:
-    """By name, the step of every checkpoint in a folder."""
+    """The step of every checkpoint in a folder, by file name."""
     files = sorted(path.parent.glob("*.safetensors"))
     return {file.name: load_checkpoint(file, kind="example")[0]["step"] for file in files}
 
@@ -175,7 +175,7 @@ def test_a_damaged_newest_is_said_and_set_aside_and_the_one_before_is_the_newest
     assert path.with_name("checkpoint.damaged.safetensors").exists()
     path.with_name("checkpoint.damaged.safetensors").unlink()
     assert steps(path)["checkpoint.safetensors"] == 3 - damaged
-    # The next one does not push a good one out for a damaged one.
+    # The next save does not drop a good checkpoint for the damaged one.
     save_checkpoint(path, {"step": 4}, META, keep=2)
     assert steps(path)["checkpoint.1.safetensors"] == 3 - damaged
 

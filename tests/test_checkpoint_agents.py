@@ -20,13 +20,13 @@ from torchrl_bmrl.training.checkpoint import save_checkpoint
 
 SMALL = {"num_cells": [8], "observation_dim": 3, "action_dim": 2}
 STUDENT = {**SMALL, "num_tasks": 3, "latent_dim": 4}
-SAID = {
+STUDENT_METADATA = {
     "tasks": ["reach", "lift", "push_up"],
     "latent_clip": 0.5,
     "accuracy": 0.9,
     "statistics": {"loc": [0.0, 1.0, 2.0], "scale": [1.0, 1.0, 0.5]},
 }
-"""What a student's checkpoint must say beside its networks."""
+"""The metadata that a student's checkpoint must contain."""
 
 path = pytest.fixture(checkpoint_path)
 
@@ -58,7 +58,9 @@ def test_a_student_comes_back_with_its_prototypes(path: Path) -> None:
     student = Student(**STUDENT)
     student.prototypes.normal_()
     save_checkpoint(
-        path, {"module": student.state_dict()}, {"kind": "student", "student": STUDENT, **SAID}
+        path,
+        {"module": student.state_dict()},
+        {"kind": "student", "student": STUDENT, **STUDENT_METADATA},
     )
     again, _ = load_student(path)
     assert same(dict(student.state_dict()), dict(again.state_dict()))
@@ -140,7 +142,7 @@ def test_settings_of_no_networks_are_refused_before_any_are_made(
 def test_what_a_student_must_say_is_checked_when_it_is_loaded(
     path: Path, key: str, value: Any
 ) -> None:
-    metadata = {"kind": "student", "student": STUDENT, **SAID, key: value}
+    metadata = {"kind": "student", "student": STUDENT, **STUDENT_METADATA, key: value}
     save_checkpoint(path, {"module": Student(**STUDENT).state_dict()}, metadata)
     with pytest.raises(CheckpointError, match=f"{key} is .*; valid: "):
         load_student(path)

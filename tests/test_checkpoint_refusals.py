@@ -75,7 +75,7 @@ def test_any_flipped_bit_is_refused_by_name_or_changes_nothing(saved: Path) -> N
         saved.write_bytes(flipped)
         try:
             assert same(load_checkpoint(saved, kind="example"), expected)
-            assert bit < 8 * (8 + length)  # in the header alone: a blank in its JSON
+            assert bit < 8 * (8 + length)  # a blank in the header's JSON
         except CheckpointError:
             refused_bits += 1
     assert refused_bits > 900
@@ -114,7 +114,7 @@ def test_a_checkpoint_without_a_checksum_is_refused_by_what_is_missing(path: Pat
 
 
 def with_header(path: Path, header: Any) -> None:
-    """Writes a checkpoint whose header says this, its checksum right if it has a place for one."""
+    """Writes a checkpoint with this header, and with a correct checksum if it is a dictionary."""
     from safetensors.torch import save
 
     from torchrl_bmrl.training import checkpoint
@@ -174,7 +174,7 @@ def test_other_shapes_are_refused_with_key_and_shapes(saved: Path) -> None:
     with pytest.raises(CheckpointError, match=r"'0.weight' has shape \(4, 3\).*\(5, 3\)") as info:
         load_state(other, state, saved)
     assert str(saved) in str(info.value)
-    assert same(before, dict(other.state_dict()))  # nothing was loaded by halves
+    assert same(before, dict(other.state_dict()))  # no tensor was loaded
 
 
 @pytest.mark.parametrize("where", ["checkpoint", "networks"])

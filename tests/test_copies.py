@@ -37,7 +37,7 @@ pytestmark = pytest.mark.filterwarnings(NO_UPDATER)
 
 def test_a_policy_of_a_critic_that_a_loss_has_copied_is_refused() -> None:
     generator, critics = ActionVAE(*DIMS), [make_qvalue_network(*DIMS) for _ in range(2)]
-    BCQPolicy(generator, critics[0])  # not yet
+    BCQPolicy(generator, critics[0])  # no loss has copied it yet
     BCQLoss(generator, critics, bounds=(-1.0, 1.0))
     with refused(
         r"qvalue_network was copied into a BCQLoss.*valid: .*live\(loss\).*frozen\(loss\)"
@@ -111,7 +111,7 @@ def on_a_torso() -> DiscreteBCQLoss:
 def test_a_copied_loss_trains_a_shared_torso_as_the_original_does(replaced: bool) -> None:
     original = on_a_torso()
     copy = deepcopy(original)
-    if replaced:  # by parameters that the critics do not share: they have a torso of their own
+    if replaced:  # the critics then have a torso of their own
         copy.generator_params = deepcopy(copy.generator_params)
     weights = []
     for loss in (original, copy):
@@ -129,7 +129,7 @@ def test_a_copied_loss_trains_a_shared_torso_as_the_original_does(replaced: bool
 
 
 class Tied(nn.Module):
-    """A critic two of whose layers are one."""
+    """A critic with two layers that share their weight."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -155,7 +155,7 @@ def test_layers_of_a_critic_that_are_one_stay_one() -> None:
 
 
 class Scaled(nn.Module):
-    """A critic with a choice that is no parameter."""
+    """A critic with an attribute that is not a parameter."""
 
     def __init__(self, scale: Any) -> None:
         super().__init__()

@@ -46,7 +46,7 @@ def expected_terms(
     latent: Tensor,
     transition: TensorDict,
 ) -> dict[str, np.ndarray]:
-    """The terms per row without their weights, in numpy, for given action latents."""
+    """The unweighted terms of every row in numpy, for given action latents."""
     observation = data["observation"].numpy()
     m = numpy_mlp(
         loss.task_encoder_params["module"],
@@ -96,7 +96,7 @@ def test_terms_are_those_of_the_equations(context: str, deactivate_vmap: bool) -
     ((_, latent, _), _), *_ = calls
     assert latent.shape == (TASKS, ROWS, LATENT_DIM)
     assert len(latent.flatten(0, 1).unique(dim=0)) == TASKS * ROWS
-    # The teachers are recomputed from the student's z: the same for both, and teacher i in row i.
+    # The expected terms use the z that the student decoded, and teacher i for row i.
     transition = data["previous"] if context == "previous" else data
     terms = expected_terms(loss, teachers, data, latent, transition)
     for name, weight in weights.items():

@@ -51,7 +51,7 @@ def test_previous_context_embeds_the_previous_transition_on_the_chosen_share(
 
 
 def identity_loss(context: str, **options: Any) -> MetaDistillationLoss:
-    """Its encoder returns the observation, so that an embedding tells which rows it is made of."""
+    """A loss whose encoder returns the observation, so that an embedding shows its rows."""
     networks = map(undeclared, make_student_networks(TASKS, torch.float64))
     _, classifier, generator, critic = networks
     encoder = TensorDictModule(
@@ -81,14 +81,14 @@ def test_context_rows_are_rows_of_the_same_task(context: str, size: int) -> None
     rows = 40
     torch.manual_seed(0)
     latent = identity_loss(context, context_size=4).embed(one_hot_rows(rows))
-    counts = (size * latent).view(TASKS, rows, TASKS, rows)  # task, row, task and row it is made of
+    counts = (size * latent).view(TASKS, rows, TASKS, rows)  # task, row; task, row of its context
     assert torch.equal(counts, counts.round())
     assert counts.min() == 0
     for i in range(TASKS):
         assert torch.equal(counts[i, :, i].sum(-1), torch.full((rows,), float(size)).double())
         made_of = counts[i, :, i]
-        assert made_of.diagonal().mean() < 0.3 * size  # another row than its own
-        assert (made_of.sum(0) > 0).double().mean() > 0.5  # all over the task's rows
+        assert made_of.diagonal().mean() < 0.3 * size  # seldom its own row
+        assert (made_of.sum(0) > 0).double().mean() > 0.5  # spread over the task's rows
 
 
 def test_current_context_is_the_paper_s_and_needs_no_previous_transition() -> None:

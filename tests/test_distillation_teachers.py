@@ -65,7 +65,7 @@ def test_teachers_are_copies() -> None:
 
 
 def widened(module: TensorDictModule) -> TensorDictModule:
-    """The same function by a wider network, whose further units are always zero."""
+    """The same function as a wider network, whose additional units are always zero."""
     module = deepcopy(module)
     network = module.module if isinstance(module.module, MLP) else module.module.network
     first, last = network[0], network[2]
@@ -148,7 +148,7 @@ def test_a_teacher_of_another_action_is_refused_and_not_broadcast() -> None:
 
     with pytest.raises(BMRLError, match=r"'action' has the size 2 in .* and 1 in a teacher"):
         build(*networks)
-    # Networks that do not say their sizes are found at the first batch.
+    # Networks that do not declare their sizes are refused at the first batch.
     loss = build(*([undeclared(x) for x in part] for part in networks))
     with pytest.raises(BMRLError, match=r"'action' has the shape \(3, 5, 1\); valid: \(3, 5, 2\)"):
         loss(task_transitions())

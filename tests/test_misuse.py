@@ -129,7 +129,7 @@ def test_a_policy_perturbs_within_its_generator_s_bounds() -> None:
 
 
 def critic(action_dim: int) -> TensorDictModule:
-    """A user's critic, which does not say its sizes."""
+    """A user's critic, which does not declare its sizes."""
     return TensorDictModule(MLP(OBSERVATION_DIM + action_dim, 1, num_cells=[4]), **CRITIC_KEYS)
 
 
@@ -192,7 +192,7 @@ def test_an_action_renamed_in_the_loss_alone_names_the_networks_that_read_the_ol
 ) -> None:
     loss, data = make_bcq_loss(), transitions(8)
     loss.set_keys(action="act")
-    if also:  # both names in the data: nothing would fail by itself
+    if also:  # the data have both names, so that no key is missing
         data["act"] = data["action"].flip(0)
     else:
         data.rename_key_("action", "act")
@@ -231,7 +231,7 @@ def test_specs_of_several_actions_at_once_are_refused_and_nested_ones_found() ->
 
 
 class Forgetful(KeyedLoss):
-    """A loss whose author forgot to say what it reads."""
+    """A loss whose author forgot to declare its keys."""
 
 
 def test_what_an_own_loss_lacks_is_named() -> None:

@@ -154,14 +154,11 @@ def a_mlp() -> nn.Module:
 
 
 def candidate_inputs(*batch: int, parts: int) -> tuple[list[Tensor], list[Tensor]]:
-    """Inputs of which all but one are a state's, expanded over five candidates, and copies."""
+    """Inputs for five candidates and contiguous copies; the second differs between candidates."""
     torch.manual_seed(1)
-    sizes = {1: (9,), 2: (6, 3), 3: (4, 3, 2)}[parts]
-    own = torch.randn(*batch, 5, sizes[1 % parts], dtype=torch.float64)
+    sizes = {2: (6, 3), 3: (4, 3, 2)}[parts]
     inputs = [
-        own
-        if i == 1 % parts
-        else torch.randn(*batch, 1, size, dtype=torch.float64).expand(*batch, 5, size)
+        torch.randn(*batch, 5 if i == 1 else 1, size, dtype=torch.float64).expand(*batch, 5, size)
         for i, size in enumerate(sizes)
     ]
     return inputs, [x.contiguous() for x in inputs]

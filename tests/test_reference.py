@@ -83,7 +83,7 @@ def compare_bcq(
     wrong: dict[str, Any] | None = None,
     **options: Any,
 ) -> Differences:
-    """The library against the reference, of which ``wrong`` options may differ."""
+    """Differences between the library and the reference, whose options ``wrong`` replaces."""
     torch.manual_seed(20)  # next values lie on both sides of both value_bounds
     loss = BCQLoss(
         Generator(),

@@ -44,13 +44,13 @@ def test_a_transition_whose_previous_one_is_not_there_is_its_own(rows: slice) ->
     data = episodes()[rows]
     result = with_previous(data, ["x", "episode", "step"])
     own = result["previous", "step"] == data["step"]
-    assert own[0]  # the last row is not before the first one
+    assert own[0]  # the first row has no predecessor
     assert torch.equal(result["previous", "episode"], data["episode"])
     assert torch.equal(result["previous", "step"][~own], data["step"][~own] - 1)
 
 
 def test_the_previous_transition_of_two_files_one_after_the_other_is_of_the_same() -> None:
-    # The second one begins where an episode of the first one ends, as far as its steps tell.
+    # By its steps, the second file continues the last episode of the first.
     first, second = episodes()[:2], episodes()[2:]
     second["episode"] = second["episode"] + 3
     result = with_previous(torch.cat([first, second]), ["episode", "step"])
@@ -61,7 +61,7 @@ def test_the_previous_transition_of_two_files_one_after_the_other_is_of_the_same
 
 
 def files() -> list[TensorDict]:
-    """Files whose episodes are numbered from 0; x tells file, episode and step."""
+    """Files whose episodes are all numbered from 0; ``file`` tells them apart."""
     found = []
     for number in range(3):
         data = episodes()
@@ -137,7 +137,7 @@ def test_slices_never_join_two_data_sets() -> None:
 def test_n_steps_never_join_two_data_sets(key: Any) -> None:
     data = [part.select("file", "next", key) for part in (x[4:5] for x in files())]
     for part in data:
-        part["next", "done"].zero_()  # cut off: the number alone tells that another one begins
+        part["next", "done"].zero_()  # cut off: only the number shows that another episode begins
     stored = joined(make_mixed_replay_buffer(data, weights=[1, 1, 1], batch_size=4))
     assert NStep(3, 0.9)(stored)["steps_to_next_obs"].flatten().tolist() == [1, 1, 1]
     collided = torch.cat([part.copy() for part in data])

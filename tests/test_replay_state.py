@@ -67,7 +67,7 @@ def test_samples_prepared_ahead_are_no_part_of_a_state(
     for buffer in (saved, loaded):
         buffer.sample()
     copy_state(way, saved, loaded, tmp_path)
-    sample = loaded.sample()  # of the loaded data, and not prepared before
+    sample = loaded.sample()  # not one that was prefetched before
     assert torch.equal(sample["number"], saved[:]["number"][sample["index"]])
     assert not [file for file in tmp_path.rglob("*") if file.suffix in (".pkl", ".pt", ".t")]
 
@@ -78,7 +78,7 @@ def test_a_dump_that_is_not_there_is_named(tmp_path: Path) -> None:
 
 
 class Executed:
-    """What runs when a pickle of it is read."""
+    """Creates a file when its pickle is read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -110,6 +110,6 @@ def test_a_pickle_in_a_dump_is_refused_and_not_executed(
         loaded.loads(tmp_path / "buffer")
     assert not (tmp_path / "executed").exists()
     assert (loaded[:] == before).all()
-    with pytest.warns(FutureWarning, match="pickle"):  # it would have been
+    with pytest.warns(FutureWarning, match="pickle"):  # tensordict's reader executes it
         TensorDict.load_memmap(folder)
     assert (tmp_path / "executed").exists()
