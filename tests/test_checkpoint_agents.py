@@ -20,7 +20,9 @@ from torchrl_bmrl.training.checkpoint import save_checkpoint
 
 SMALL = {"num_cells": [8], "observation_dim": 3, "action_dim": 2}
 STUDENT = {**SMALL, "num_tasks": 3, "latent_dim": 4}
-STUDENT_METADATA = {
+METADATA = {
+    "kind": "student",
+    "student": STUDENT,
     "tasks": ["reach", "lift", "push_up"],
     "latent_clip": 0.5,
     "accuracy": 0.9,
@@ -57,11 +59,7 @@ def test_a_trained_loss_comes_back_from_its_file_alone(path: Path, perturbation:
 def test_a_student_comes_back_with_its_prototypes(path: Path) -> None:
     student = Student(**STUDENT)
     student.prototypes.normal_()
-    save_checkpoint(
-        path,
-        {"module": student.state_dict()},
-        {"kind": "student", "student": STUDENT, **STUDENT_METADATA},
-    )
+    save_checkpoint(path, {"module": student.state_dict()}, METADATA)
     again, _ = load_student(path)
     assert same(dict(student.state_dict()), dict(again.state_dict()))
 
@@ -72,7 +70,7 @@ def test_a_student_comes_back_with_its_prototypes(path: Path) -> None:
 def test_a_student_without_an_encoder_is_refused_by_the_missing_key(path: Path) -> None:
     state = Student(**STUDENT).state_dict()
     rest = {key: value for key, value in state.items() if not key.startswith("task_encoder")}
-    save_checkpoint(path, {"module": rest}, {"kind": "student", "student": STUDENT})
+    save_checkpoint(path, {"module": rest}, METADATA)
     with pytest.raises(CheckpointError, match="task_encoder"):
         load_student(path)
 
@@ -142,7 +140,7 @@ def test_settings_of_no_networks_are_refused_before_any_are_made(
 def test_what_a_student_must_say_is_checked_when_it_is_loaded(
     path: Path, key: str, value: Any
 ) -> None:
-    metadata = {"kind": "student", "student": STUDENT, **STUDENT_METADATA, key: value}
-    save_checkpoint(path, {"module": Student(**STUDENT).state_dict()}, metadata)
+    state = {"module": Student(**STUDENT).state_dict()}
+    save_checkpoint(path, state, {**METADATA, key: value})
     with pytest.raises(CheckpointError, match=f"{key} is .*; valid: "):
         load_student(path)
