@@ -31,6 +31,19 @@ from torchrl_bmrl.modules import PLASPolicy, make_decoder, make_qvalue_network
 from torchrl_bmrl.objectives import MetaDistillationLoss
 
 
+def widened(module: TensorDictModule) -> TensorDictModule:
+    """The same function as a wider network, whose additional units are always zero."""
+    module = deepcopy(module)
+    network = module.module if isinstance(module.module, MLP) else module.module.network
+    first, last = network[0], network[2]
+    for layer, name in ((first, "weight"), (first, "bias")):
+        value = getattr(layer, name).data
+        setattr(layer, name, nn.Parameter(torch.cat([value, torch.zeros_like(value)])))
+    more = torch.randn_like(last.weight.data)
+    last.weight = nn.Parameter(torch.cat([last.weight.data, more], -1))
+    return module
+
+
 def test_teachers_are_no_parameters_and_do_not_change() -> None:
     generators, critics = make_teachers(TASKS)
     before = [p.detach().clone() for module in (*generators, *critics) for p in module.parameters()]
@@ -49,32 +62,19 @@ def test_teachers_are_no_parameters_and_do_not_change() -> None:
 
 
 def test_teachers_are_copies() -> None:
-    generators, critics = make_teachers(TASKS)
-    loss = make_distillation_loss(teachers=(generators, critics))
-    results = []
-    for _ in range(2):
-        torch.manual_seed(1)
-        results.append(loss(task_transitions()))
+    for wide in (False, True):  # stacked, and one after the other
+        generators, critics = make_teachers(TASKS)
+        if wide:
+            generators[1], critics[2] = widened(generators[1]), widened(critics[2])
+        loss = make_distillation_loss(teachers=(generators, critics))
+        before = run(loss, task_transitions())
         for module in (*generators, *critics):
             for parameter in module.parameters():
                 parameter.data.add_(1.0)
-    assert (results[0] == results[1]).all()
+        assert (run(loss, task_transitions()) == before).all()
 
 
 # -- teachers of any kind --------------------------------------------------------------------------
-
-
-def widened(module: TensorDictModule) -> TensorDictModule:
-    """The same function as a wider network, whose additional units are always zero."""
-    module = deepcopy(module)
-    network = module.module if isinstance(module.module, MLP) else module.module.network
-    first, last = network[0], network[2]
-    for layer, name in ((first, "weight"), (first, "bias")):
-        value = getattr(layer, name).data
-        setattr(layer, name, nn.Parameter(torch.cat([value, torch.zeros_like(value)])))
-    more = torch.randn_like(last.weight.data)
-    last.weight = nn.Parameter(torch.cat([last.weight.data, more], -1))
-    return module
 
 
 def test_teachers_of_different_widths_teach_as_equally_wide_ones() -> None:
