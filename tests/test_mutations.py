@@ -86,9 +86,9 @@ STRUCTURAL: dict[str, tuple[Edit, tuple[str, ...]]] = {
     "terminated at once": (lambda demo, key: rewrite(demo, key, np.ones_like), ("terminated",)),
 }
 UNREAD = ("phases", "states")
-"""A replay buffer loads its data without them, whatever they are."""
+"""A replay buffer does not read these arrays and accepts any values in them."""
 ONE_NUMBER = ("rewards", "terminated", "successes")
-"""A column of them is as good as a row: (T, 1) is how TorchRL has them."""
+"""These arrays may also have the shape (T, 1), as in TorchRL."""
 
 
 def damage_group(file: Any, rng: np.random.Generator) -> str:
