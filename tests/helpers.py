@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
@@ -20,6 +21,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
+from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.generators import Autoencoder
 from torchrl_bmrl.modules import (
     ActionVAE,
@@ -37,6 +39,7 @@ from torchrl_bmrl.objectives import (
     FQELoss,
     MetaDistillationLoss,
     PLASLoss,
+    StackedLoss,
 )
 from torchrl_bmrl.testing import Case, discrete_transitions, transitions
 from torchrl_bmrl.testing.measures import as_keywords as as_keywords
@@ -46,12 +49,16 @@ from torchrl_bmrl.testing.measures import state as state
 from torchrl_bmrl.testing.measures import total as total
 
 OBSERVATION_DIM, ACTION_DIM, LATENT_DIM, TASK_LATENT_DIM = 3, 2, 4, 2
+DIMS = (OBSERVATION_DIM, ACTION_DIM)
 NUM_ACTIONS = 3
+TASKS, ROWS = 3, 5
 CELLS = (8,)
 NO_UPDATER = "ignore:No target network updater"
 
 
-def task_transitions(num_tasks: int, rows: int, dtype: torch.dtype = torch.float64) -> TensorDict:
+def task_transitions(
+    num_tasks: int = TASKS, rows: int = ROWS, dtype: torch.dtype = torch.float64
+) -> TensorDict:
     """Random transitions of several tasks, each with the one before it."""
     data = transitions(num_tasks, rows, dtype=dtype)
     data["task"] = torch.arange(num_tasks).unsqueeze(-1).expand(num_tasks, rows).clone()
@@ -59,7 +66,19 @@ def task_transitions(num_tasks: int, rows: int, dtype: torch.dtype = torch.float
     return data
 
 
-# -- losses, small, as cases of the contract ------------------------------------------------------
+def refused(message: str) -> Any:
+    """Expects the library's error with a message that matches."""
+    return pytest.raises(BMRLError, match=message)
+
+
+def observations(*batch: int) -> TensorDict:
+    """Random observations, the same at every call."""
+    generator = torch.Generator().manual_seed(0)
+    observation = torch.randn(*batch, OBSERVATION_DIM, generator=generator)
+    return TensorDict({"observation": observation}, batch_size=batch)
+
+
+# -- losses, small, as cases of the contract -------------------------------------------------------
 
 Q, XI, M, G = "qvalue_network", "perturbation_network", "task_encoder", "student_generator"
 ACTOR = "actor_network"
@@ -72,10 +91,12 @@ STUDENT = {
     "latent_norm": {M},
 }
 BOUNDS = {"bounds": (-1.0, 1.0)}
+CRITIC_KEYS = {"in_keys": ["observation", "action"], "out_keys": ["state_action_value"]}
+"""The keys of a critic that a test writes itself."""
 
 
 def undeclared(module: Any) -> Any:
-    """The network as a user writes it: it says neither its sizes nor its bounds."""
+    """The network as a user writes it, without its sizes and bounds."""
     if isinstance(module, ActionVAE):
         parts = undeclared(module.encoder), undeclared(module.decoder)
         return Autoencoder(*parts, module.latent_dim)
@@ -89,20 +110,18 @@ def undeclare(name: str, network: Any) -> Any:
 
 def make_generator(dtype: torch.dtype = torch.float64) -> ActionVAE:
     """A small variational autoencoder."""
-    return ActionVAE(OBSERVATION_DIM, ACTION_DIM, num_cells=CELLS).to(dtype)
+    return ActionVAE(*DIMS, num_cells=CELLS).to(dtype)
 
 
 def make_critics(number: int, dtype: torch.dtype = torch.float64) -> list[TensorDictModule]:
     """Small critics of continuous actions."""
-    dims = (OBSERVATION_DIM, ACTION_DIM)
-    return [make_qvalue_network(*dims, num_cells=CELLS).to(dtype) for _ in range(number)]
+    return [make_qvalue_network(*DIMS, num_cells=CELLS).to(dtype) for _ in range(number)]
 
 
 def bcq_networks(perturbation: bool) -> dict[str, Any]:
-    dims = (OBSERVATION_DIM, ACTION_DIM)
     networks: dict[str, Any] = {"generator": make_generator(), Q: make_critics(1)[0]}
     if perturbation:
-        networks[XI] = make_perturbation_network(*dims, num_cells=CELLS)
+        networks[XI] = make_perturbation_network(*DIMS, num_cells=CELLS)
     return networks
 
 
@@ -115,6 +134,12 @@ def bcq_case(perturbation: bool = False) -> Case:
 def make_bcq_loss(*, perturbation: bool = False, **options: Any) -> BCQLoss:
     """A small loss whose target networks differ from the trained ones."""
     return bcq_case(perturbation).make(**options)
+
+
+def stack_of_bcq(number: int = 2) -> tuple[StackedLoss, TensorDict]:
+    """A stack of losses with seeds 0, 1, ..., and a batch of other transitions for each."""
+    losses = [make_bcq_loss(seed=seed) for seed in range(number)]
+    return StackedLoss(losses), torch.stack([transitions(8, seed=seed) for seed in range(number)])
 
 
 def plas_networks(perturbation: bool) -> dict[str, Any]:
@@ -158,12 +183,12 @@ def make_policy(
     dtype: torch.dtype, in_key: NestedKey = "observation", out_key: NestedKey = "action"
 ) -> TensorDictModule:
     """A small deterministic policy."""
-    network = nn.Sequential(make_mlp(OBSERVATION_DIM, ACTION_DIM, CELLS), nn.Tanh()).to(dtype)
+    network = nn.Sequential(make_mlp(*DIMS, CELLS), nn.Tanh()).to(dtype)
     return TensorDictModule(network, in_keys=[in_key], out_keys=[out_key])
 
 
 def evaluate_a_policy(qvalue_network: Any, policy: Any = None, **options: Any) -> FQELoss:
-    """The loss with a policy under the keys of the critics: it is trained by nobody."""
+    """A loss whose policy reads and writes the critics' keys and is not trained."""
     if policy is None:
         several = isinstance(qvalue_network, list)
         first = next(iter(qvalue_network), None) if several else qvalue_network
@@ -183,12 +208,11 @@ def make_fqe_loss(**options: Any) -> FQELoss:
 
 def make_student_networks(num_tasks: int, dtype: torch.dtype) -> list[TensorDictModule]:
     """Encoder, classifier, generator and critic of a student."""
-    dims = (OBSERVATION_DIM, ACTION_DIM)
     networks = [
-        make_task_encoder(*dims, TASK_LATENT_DIM, num_cells=CELLS),
+        make_task_encoder(*DIMS, TASK_LATENT_DIM, num_cells=CELLS),
         make_task_classifier(num_tasks, TASK_LATENT_DIM),
-        make_decoder(*dims, LATENT_DIM, task_latent_dim=TASK_LATENT_DIM, num_cells=CELLS),
-        make_qvalue_network(*dims, task_latent_dim=TASK_LATENT_DIM, num_cells=CELLS),
+        make_decoder(*DIMS, LATENT_DIM, task_latent_dim=TASK_LATENT_DIM, num_cells=CELLS),
+        make_qvalue_network(*DIMS, task_latent_dim=TASK_LATENT_DIM, num_cells=CELLS),
     ]
     return [network.to(dtype) for network in networks]
 
@@ -197,14 +221,13 @@ def make_teachers(
     num_tasks: int, dtype: torch.dtype = torch.float64
 ) -> tuple[list[TensorDictModule], list[TensorDictModule]]:
     """One decoder and one critic per task."""
-    dims = (OBSERVATION_DIM, ACTION_DIM)
     return (
-        [make_decoder(*dims, LATENT_DIM, num_cells=CELLS).to(dtype) for _ in range(num_tasks)],
-        [make_qvalue_network(*dims, num_cells=CELLS).to(dtype) for _ in range(num_tasks)],
+        [make_decoder(*DIMS, LATENT_DIM, num_cells=CELLS).to(dtype) for _ in range(num_tasks)],
+        [make_qvalue_network(*DIMS, num_cells=CELLS).to(dtype) for _ in range(num_tasks)],
     )
 
 
-def distillation_networks(num_tasks: int = 3, teachers: Any = None) -> dict[str, Any]:
+def distillation_networks(num_tasks: int = TASKS, teachers: Any = None) -> dict[str, Any]:
     student = make_student_networks(num_tasks, torch.float64)
     names = (M, "task_classifier", G, "student_qvalue_network")
     generators, critics = teachers or make_teachers(num_tasks)
@@ -215,7 +238,7 @@ def distillation_networks(num_tasks: int = 3, teachers: Any = None) -> dict[str,
 def distillation_case(
     trains: dict[str, set[str]] = STUDENT,
     *,
-    num_tasks: int = 3,
+    num_tasks: int = TASKS,
     teachers: Any = None,
     **options: Any,
 ) -> Case:
@@ -225,14 +248,14 @@ def distillation_case(
         trains,
         options={"latent_dim": LATENT_DIM, "context": "current", **options},
         data=task_transitions,
-        shape=(3, 5),
+        shape=(TASKS, ROWS),
         need_not_fall=("latent_norm",),  # the penalty on m pays for the other terms
         mixes_rows=options.get("context") in ("random", "set"),
     )
 
 
 def make_distillation_loss(
-    *, num_tasks: int = 3, teachers: Any = None, **options: Any
+    *, num_tasks: int = TASKS, teachers: Any = None, **options: Any
 ) -> MetaDistillationLoss:
     """A small loss with teachers of its own."""
     return distillation_case(num_tasks=num_tasks, teachers=teachers).make(**options)
@@ -248,7 +271,7 @@ def guide(name: str = "extending") -> ModuleType:
     return sys.modules[name]
 
 
-# -- networks, watched and repeated ----------------------------------------------------------------
+# -- networks, recorded and recomputed -------------------------------------------------------------
 
 
 def recorded(module: nn.Module) -> list[tuple[tuple[Tensor, ...], Tensor]]:

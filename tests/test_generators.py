@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 import torch
 from helpers import (
-    ACTION_DIM,
     BOUNDS,
     CRITICS,
+    DIMS,
     NO_UPDATER,
     OBSERVATION_DIM,
     Q,
@@ -28,7 +28,6 @@ from torchrl_bmrl.objectives import BCQLoss, PLASLoss, StackedLoss
 from torchrl_bmrl.testing import Case, OfflineLossContract
 
 pytestmark = pytest.mark.filterwarnings(NO_UPDATER)
-DIMS = (OBSERVATION_DIM, ACTION_DIM)
 Flow = guide("generators").Flow  # now: the page draws random numbers when it runs
 
 

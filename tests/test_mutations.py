@@ -1,4 +1,4 @@
-"""Good files, mutated in hundreds of ways: each is refused with its name, or loads correctly."""
+"""A valid file, mutated in hundreds of ways, is refused by name or loads correctly."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def with_value(index: int, value: float) -> Callable[[np.ndarray], np.ndarray]:
 Edit = Callable[[Any, str], object]
 CHECKED = (*ARRAYS, *PARTS)
 STRUCTURAL: dict[str, tuple[Edit, tuple[str, ...]]] = {
-    # name: what is done to an array of an episode, the arrays that it is done to
-    # Without `terminated` an episode truncates, as in files of robomimic's own.
+    # name: the edit of an array of an episode, and the arrays that it is applied to
+    # Without `terminated` an episode counts as truncated, as in robomimic's own files.
     "deleted": (
         lambda demo, key: demo.pop(key),
         tuple(key for key in CHECKED if key != "terminated"),
@@ -86,13 +86,13 @@ STRUCTURAL: dict[str, tuple[Edit, tuple[str, ...]]] = {
     "terminated at once": (lambda demo, key: rewrite(demo, key, np.ones_like), ("terminated",)),
 }
 UNREAD = ("phases", "states")
-"""A replay buffer loads its data without them, whatever they are."""
+"""A replay buffer does not read these arrays and accepts any values in them."""
 ONE_NUMBER = ("rewards", "terminated", "successes")
-"""A column of them is as good as a row: (T, 1) is how TorchRL has them."""
+"""These arrays may also have the shape (T, 1), as in TorchRL."""
 
 
 def damage_group(file: Any, rng: np.random.Generator) -> str:
-    """Damages something else than an array; returns the key."""
+    """Damages a group or the arrays of an episode as a whole; returns the key."""
     key = demo = f"data/{rng.choice(NAMES[1:])}"
     other = "data/demo_0"
     choice = rng.integers(7)
@@ -102,7 +102,7 @@ def damage_group(file: Any, rng: np.random.Generator) -> str:
     elif choice == 1:
         del file[demo]
         file[demo] = np.zeros((5, 7))
-    elif choice == 2:  # of the other length
+    elif choice == 2:  # of another length
         file.move(f"{demo}/actions", f"{demo}/spare")
         file[f"{demo}/actions"] = file[f"{other}/actions"]
         del file[f"{demo}/spare"]
@@ -142,7 +142,7 @@ def damage_mask(file: Any, rng: np.random.Generator) -> str:
 
 
 def damage_attribute(file: Any, rng: np.random.Generator) -> str:
-    """Gives an attribute another type, which no array depends on."""
+    """Gives an attribute, which no array depends on, a value of another type."""
     values = (3.5, b"\xff\xfe", "{", h5py.Empty("f8"), np.zeros((2, 2)), ["a"], 1j, file.ref)
     group = file[rng.choice(["data", "data/demo_1"])]
     name = str(rng.choice([*group.attrs, "new"]))
@@ -154,7 +154,7 @@ def damage_attribute(file: Any, rng: np.random.Generator) -> str:
 
 
 def load(path: Path, root: Path, split: str | None) -> tuple[str | None, str | None, Any]:
-    """Key and text of the refusal, or the data; nothing but a finished folder is left behind."""
+    """Key and text of the refusal, or the data; asserts that no unfinished folder remains."""
     before = path.read_bytes()
     key = text = data = None
     try:
@@ -170,7 +170,7 @@ def load(path: Path, root: Path, split: str | None) -> tuple[str | None, str | N
 
 
 def check(path: Path) -> tuple[list[tuple[str | None, str]], Any]:
-    """Everything that the check finds, and the episodes where it finds nothing."""
+    """The problems that the check finds, and the episodes if it finds none."""
     try:
         metadata = read_metadata(path)
         with open_episodes(path) as episodes:
@@ -181,7 +181,7 @@ def check(path: Path) -> tuple[list[tuple[str | None, str]], Any]:
 
 
 def assert_equal(ours: Any, theirs: Any, where: str = "") -> None:
-    """Equal to the bit, through nested dictionaries."""
+    """Asserts that nested dictionaries are equal to the bit."""
     if isinstance(theirs, dict):
         assert set(ours) == set(theirs), where
         for key in theirs:
@@ -210,10 +210,10 @@ def plain_episodes(checked: Any) -> Any:
 
 
 class Mutator:
-    """Mutates one good file and looks at what comes of it.
+    """Mutates one valid file and checks the outcome.
 
     Args:
-        folder: to work in.
+        folder: where the files are written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -230,7 +230,7 @@ class Mutator:
         self.episodes = plain_episodes(check(self.path)[1])
 
     def bytes(self, kind: str, seed: int) -> Outcome:
-        """A mutation of bytes: whatever loads is the original."""
+        """Mutates bytes: data that still load must be the original."""
         data = bytearray(self.good)
         BYTES[kind][0](data, np.random.default_rng(seed))
         self.path.write_bytes(data)
@@ -247,7 +247,7 @@ class Mutator:
         return {"outcome": "refused" if problems else "loaded", "text": text}
 
     def structural(self, kind: str, seed: int) -> Outcome:
-        """A mutation of one array: refused, with its key."""
+        """Mutates one array: the file must be refused with its key."""
         edit, keys = STRUCTURAL[kind]
         demo, key = NAMES[seed % len(NAMES)], keys[seed]
         self.mutate(lambda file: edit(file[f"data/{demo}"], key))
@@ -260,7 +260,7 @@ class Mutator:
         assert text is not None, f"data/{demo}/{key} was loaded"
         assert text.startswith(f"{self.path}: data/demo_"), text
         assert problems, f"data/{demo}/{key} passed the check"
-        # Wherever the first episode is the damaged one, the others differ from it.
+        # If the first episode is damaged, the check may name the others, which differ from it.
         named = key.removesuffix("_").split("/")[-1]
         assert any(named in str(where) for where, _ in problems), problems
         if kind in ("NaN", "inf", "neither 0 nor 1", "three times as large", "terminated at once"):
@@ -268,7 +268,7 @@ class Mutator:
         return {"outcome": "refused", "text": text}
 
     def other(self, kind: str, seed: int) -> Outcome:
-        """A mutation of a group, a mask or an attribute."""
+        """Mutates a group, a mask or an attribute."""
         rng = np.random.default_rng(seed)
         edit = {"group": damage_group, "mask": damage_mask, "attribute": damage_attribute}[kind]
         keys: list[str] = []
@@ -328,7 +328,8 @@ def test_every_mutated_file_is_refused_by_name_or_loads_correctly(
 
 
 def test_every_kind_of_mutation_is_tried(outcomes: list[tuple[Any, Outcome]]) -> None:
-    assert {kind for (_, kind, _), _ in outcomes} >= {*BYTES, *STRUCTURAL}
+    kinds = {kind for (_, kind, _), _ in outcomes}
+    assert kinds == {*BYTES, *STRUCTURAL, "group", "mask", "attribute"}
 
 
 def test_damage_to_what_is_read_is_found(outcomes: list[tuple[Any, Outcome]]) -> None:

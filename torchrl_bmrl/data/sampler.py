@@ -184,9 +184,11 @@ class DatasetBuffer(TensorDictReplayBuffer):
         try:
             self.sampler.loads(path / "sampler")  # before the storage is overwritten
             read_memmap(path / "storage")  # refuses pickles, which TorchRL's reader would load
-            self.storage.loads(path / "storage")
-            if self._rng is not None and (path / "rng_state").exists():
-                self._rng.set_state(read_memmap(path / "rng_state")["rng_state"])
+            with self._futures_lock:
+                self._clear_prefetch_queue_locked()  # its samples are of the data before
+                self.storage.loads(path / "storage")
+                if self._rng is not None and (path / "rng_state").exists():
+                    self._rng.set_state(read_memmap(path / "rng_state")["rng_state"])
         except BMRLError:
             raise
         except (OSError, RuntimeError, KeyError, ValueError) as error:
