@@ -21,6 +21,8 @@ torch.set_num_threads(1)
 # Modules whose import, or whose docstrings' examples, need an extra.
 _NEEDS = {
     "gymnasium": [
+        "tests/scene_state.py",
+        "tests/stock_robosuite.py",
         "torchrl_bmrl/data/convert.py",
         "torchrl_bmrl/data/demonstrations.py",
         "torchrl_bmrl/envs/*",
@@ -46,17 +48,29 @@ _NEEDS = {
         "torchrl_bmrl/reports/films.py",
     ],
     "hydra": ["tests/small_runs.py", "torchrl_bmrl/configs.py"],
-    "matplotlib": ["tests/published_data.py", "torchrl_bmrl/reports/*"],
+    "matplotlib": [
+        "tests/explorers.py",
+        "tests/published_data.py",
+        "tests/report_data.py",
+        "torchrl_bmrl/reports/*",
+    ],
     "minari": ["torchrl_bmrl/data/convert.py"],
     "mujoco": ["torchrl_bmrl/reports/films.py"],
     "onnxscript": ["torchrl_bmrl/export.py"],
     "robosuite": [
+        "tests/scene_state.py",
+        "tests/stock_robosuite.py",
         "torchrl_bmrl/envs/*",
         "torchrl_bmrl/evaluation/rollout.py",
         "torchrl_bmrl/experts/*",
     ],
     "safetensors": ["torchrl_bmrl/pipeline/agents.py", "torchrl_bmrl/training/checkpoint.py"],
-    "scipy": ["torchrl_bmrl/evaluation/*", "torchrl_bmrl/reports/*"],
+    "scipy": [
+        "tests/explorers.py",
+        "tests/report_data.py",
+        "torchrl_bmrl/evaluation/*",
+        "torchrl_bmrl/reports/*",
+    ],
     "sklearn": ["torchrl_bmrl/evaluation/embedding.py", "torchrl_bmrl/reports/figures.py"],
     "tqdm": [
         "torchrl_bmrl/data/__main__.py",
