@@ -18,7 +18,7 @@ pytest.importorskip("safetensors")
 pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
-from small_runs import STAGES, Run, contents, exit_code, tasks, times
+from small_runs import SMALL, STAGES, Run, configured, contents, exit_code, tasks, times
 
 from torchrl_bmrl.run.locks import lock
 
@@ -33,10 +33,8 @@ def test_a_second_run_in_a_folder_is_refused_by_the_owner_and_writes_nothing(
     before = contents(finished_copy, "**/*")
     with lock(finished_copy):
         assert exit_code(run, finished_copy, two_stage) == 1
-        assert (
-            f"error: {finished_copy}: in use by process {os.getpid()} on "
-            in capsys.readouterr().err
-        )
+        said = capsys.readouterr().err
+        assert f"error: {finished_copy}: in use by process {os.getpid()} on " in said
         after = contents(finished_copy, "**/*")
     new = {name for name in after if name not in before}
     assert all(name.startswith(".locks") for name in new)
@@ -47,8 +45,6 @@ def test_a_second_run_in_a_folder_is_refused_by_the_owner_and_writes_nothing(
 def test_jobs_of_other_tasks_share_a_folder_and_the_same_task_is_refused(
     run: Run, collected_run: Path, recipes: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from small_runs import SMALL, configured
-
     from torchrl_bmrl.pipeline import stage1
 
     def train(task: str) -> None:
