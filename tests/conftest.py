@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -66,9 +67,9 @@ def minari_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "minari"
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def recipes() -> Iterator[Any]:
-    """The module that runs a recipe; recipes are importable as for a script beside them."""
+    """Module ``command`` of the recipes, which are importable as for a script beside them."""
     with pytest.MonkeyPatch.context() as patch:
         from small_runs import RECIPES
 
@@ -78,7 +79,7 @@ def recipes() -> Iterator[Any]:
         yield command
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(recipes: Any) -> Any:
     """Runs a function of the pipeline or a study as its recipe does, in this process."""
     pytest.importorskip("robosuite", exc_type=ImportError)
@@ -92,9 +93,34 @@ def run(recipes: Any) -> Any:
     return run
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def finished(run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of all stages that was never stopped."""
+    """A run of all stages that was never stopped. Tests only read it."""
     from torchrl_bmrl.pipeline import two_stage
 
     return run(tmp_path_factory.mktemp("finished"), two_stage)
+
+
+@pytest.fixture
+def finished_copy(finished: Path, tmp_path: Path) -> Path:
+    """A copy of the finished run, which a test may change."""
+    return shutil.copytree(finished, tmp_path / "run")
+
+
+@pytest.fixture
+def collected_run(finished: Path, tmp_path: Path) -> Path:
+    """A run folder that contains the finished run's demonstrations and nothing else."""
+    shutil.copytree(finished / "data", tmp_path / "run" / "data")
+    return tmp_path / "run"
+
+
+@pytest.fixture(scope="session")
+def envs() -> Iterator[dict[str, Any]]:
+    """The environment of each of the six tasks. Tests reset it before they use it."""
+    from torchrl_bmrl.envs.skills import SKILLS
+    from torchrl_bmrl.envs.tabletop import TabletopEnv
+
+    made = {task: TabletopEnv(task) for task in SKILLS}
+    yield made
+    for env in made.values():
+        env.close()

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from observations import OBSERVATION_SHAPES
 
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import open_episodes, write_episodes
@@ -19,16 +20,7 @@ from torchrl_bmrl.data.schema import arrays_of
 Parts = Mapping[str, tuple[tuple[int, ...], Any]]
 """Shape of a row and dtype of each part of an observation."""
 PARTS: Parts = {"object": ((10,), np.float64), "image": ((8, 8, 3), np.uint8)}
-"""Other parts than the six tasks have: any robot's observations can be stored."""
-OBSERVATION_SHAPES: dict[str, int] = {
-    "robot0_joint_pos": 7,
-    "robot0_gripper_qpos": 2,
-    "robot0_joint_vel": 7,
-    "robot0_eef_pos": 3,
-    "robot0_eef_quat": 4,
-    "goal_pos": 3,
-}
-"""Parts of the six tasks' observation and their sizes, in the order of the environment."""
+"""An observation unlike that of the six tasks: files may contain any robot's."""
 TASK_PARTS: Parts = {name: ((size,), np.float64) for name, size in OBSERVATION_SHAPES.items()}
 LENGTHS = (5, 6, 7, 8)
 ENV_ARGS = {"env_name": "BMRLSawyerLift", "type": 1, "env_version": "1", "env_kwargs": {"a": 1}}

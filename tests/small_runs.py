@@ -48,6 +48,8 @@ SMALL = [
 ]
 Run = Callable[..., Path]
 """Runs a recipe's function in a folder, in this process; fixture ``run``."""
+STAGES = ("bcq/*/*", "distill/*", "results.csv", "tables/*", "logs/*/scalars/*")
+"""Files that training and evaluation write and that are the same whenever a run is repeated."""
 
 
 def configured(*overrides: str) -> DictConfig:
@@ -122,7 +124,15 @@ def started(recipes: Any, name: str, *overrides: str) -> tuple[int, list[Any]]:
         return command_line(name, *overrides), ran
 
 
+def exit_code(run: Run, folder: Path, function: Any, *overrides: str) -> int:
+    """Exit code of a recipe that fails or is stopped."""
+    with pytest.raises(SystemExit) as end:
+        run(folder, function, *overrides)
+    return int(end.value.code)  # type: ignore[arg-type]
+
+
 def contents(folder: Path, *patterns: str) -> dict[str, bytes]:
+    """Contents of the files that match one of the patterns, by their paths in the folder."""
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for pattern in patterns
@@ -132,7 +142,7 @@ def contents(folder: Path, *patterns: str) -> dict[str, bytes]:
 
 
 def times(folder: Path) -> dict[str, int]:
-    """When what is costly was written."""
+    """Modification times of the files that are costly to make."""
     patterns = ("data/*.hdf5", "**/*.safetensors", "evaluation/*.csv", "bcq/*/evaluations.csv")
     return {
         str(path.relative_to(folder)): path.stat().st_mtime_ns

@@ -14,7 +14,7 @@ pytest.importorskip("robosuite", exc_type=ImportError)
 pytest.importorskip("h5py")
 
 import h5py
-from episode_files import OBSERVATION_SHAPES
+from observations import OBSERVATION_SHAPES
 
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import open_episodes, read_kept_episode

@@ -176,7 +176,7 @@ RECIPES = [(page, parts(line)) for page, line in COMMANDS if "python recipes/" i
 def test_every_command_of_a_recipe_gives_settings_that_it_takes(
     page: Path, words: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What the recipes then do, test_recipes.py and its like execute at small sizes."""
+    """Only settings are checked here; test_recipes.py and its like run small recipes."""
     recipe = Path(words[1]).stem
     for package in ("hydra", "gymnasium", "h5py", "safetensors", "scipy", "tqdm"):
         pytest.importorskip(package)

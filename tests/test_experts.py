@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -26,14 +25,6 @@ PHASES = {
     "lift": ("descend", "grasp", "lift"),
     **dict.fromkeys([t for t in TASKS if "push" in t], ("approach", "contact", "push")),
 }
-
-
-@pytest.fixture(scope="module")
-def envs() -> Iterator[dict[str, TabletopEnv]]:
-    made = {task: TabletopEnv(task) for task in TASKS}
-    yield made
-    for env in made.values():
-        env.close()
 
 
 def act(

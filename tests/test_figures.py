@@ -1,4 +1,4 @@
-"""Figures draw the numbers that they are given: read back from the axes."""
+"""Figures repeat exactly, change with their data, and refuse what they cannot draw."""
 
 # ruff: noqa: E402 -- the package's imports need the extras that the skip checks
 from __future__ import annotations
@@ -7,76 +7,129 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 for extra in ("scipy", "matplotlib", "jinja2", "sklearn"):
     pytest.importorskip(extra)
 
-from torchrl_bmrl.reports import embedding_figures, figures
+from report_data import NAMES, make_embeddings
+
+from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.reports import (
+    behaviour_trajectories,
+    embedding_paths,
+    embedding_scatter,
+    embedding_stages,
+    embedding_trajectories,
+    embedding_tsne,
+    stage1_curves,
+    task_colors,
+)
+from torchrl_bmrl.reports.drawing import _lab
 
 
-@pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """The figures that were drawn."""
-    found: list[Any] = []
-    for module in (figures, embedding_figures):
-        monkeypatch.setattr(module, "png", lambda figure: found.append(figure) or b"")
-    return found
+def trajectories(*arguments: Any, **options: Any) -> bytes:
+    return embedding_trajectories(*arguments, title="Reach", **options)
 
 
-def test_a_training_curve_has_its_mean_its_band_and_its_experts_line(drawn: list[Any]) -> None:
-    returns = [np.array([10.0, 30.0]), np.array([40.0, 40.0])]
-    curve = [(epoch, 50 * epoch, values) for epoch, values in enumerate(returns, start=1)]
-    figures.stage1_curves({"lift": curve}, expert_means={"lift": 35.0})
-    (axes,) = drawn[0].axes
-    mean, expert = (line for line in axes.lines if line.get_alpha() != 0)  # one is invisible
-    assert_allclose(mean.get_xydata(), [[1, 20], [2, 40]])
-    assert_allclose(expert.get_ydata(), 35)
-    band = axes.collections[0].get_paths()[0].vertices
-    assert sorted({y for x, y in band if x == 1}) == [10, 30]
-    assert {y for x, y in band if x == 2} == {40}
-    assert drawn[0].get_supxlabel() == "Epoch (50 updates each)"
+@pytest.mark.parametrize("count", [6, 14, 24])
+def test_colors_are_far_apart_and_do_not_change_with_the_number_of_tasks(count: int) -> None:
+    colors = task_colors(count)
+    assert colors[:3] == task_colors(3)
+    assert len(colors) == count
+    lab = _lab(np.array([[int(c[i : i + 2], 16) / 255 for i in (1, 3, 5)] for c in colors]))
+    apart = np.linalg.norm(lab[:, None] - lab, axis=-1)[~np.eye(count, dtype=bool)]
+    assert apart.min() > 25.0  # a just noticeable difference is about 2
+    assert lab[:, 0].max() < 80.0  # dark enough on white
 
 
-def test_epochs_of_different_lengths_have_none_on_the_axis(drawn: list[Any]) -> None:
-    curve = [(1, 50, np.ones(1)), (2, 150, np.ones(1))]
-    figures.stage1_curves({"lift": curve})
-    assert drawn[0].get_supxlabel() == "Epoch"
+def test_figures_repeat_exactly_and_change_with_the_data() -> None:
+    data = make_embeddings()
+    moved = data.task_latent + data.step[:, None]
+    curve = [(e, 10 * e, np.array([1.0 * e, 2.0 * e])) for e in (1, 2, 3)]
+    draws = [
+        lambda m: embedding_scatter(m, data.task, NAMES),
+        lambda m: embedding_tsne(m, data.task, NAMES, seed=0),
+        lambda m: trajectories(m, data.episode, data.distance),
+        lambda m: trajectories(m, data.episode, data.distance, success_point=m[0]),
+        lambda m: embedding_stages(m, data.phase, data.step // 3, ("a", "b", "c")),
+        lambda m: stage1_curves({"lift": curve}, expert_means={"lift": float(m.sum())}),
+        lambda m: embedding_paths(
+            m, data.task, NAMES, {"straight": [m[:5]], "curve": [m[3:7]]}, m[:2]
+        ),
+        lambda m: behaviour_trajectories(
+            {"line": np.tile(m, (1, 1, 2))[..., :3]}, {"line": m[:1, :1]}
+        ),
+    ]
+    for draw in draws:
+        image = draw(data.task_latent)
+        assert image.startswith(b"\x89PNG")
+        assert len(image) < 300_000
+        assert draw(data.task_latent) == image
+        assert draw(moved) != image
 
 
-def test_the_thick_line_is_the_mean_over_seeds_at_the_steps_of_all(drawn: list[Any]) -> None:
-    seeds = [np.array([[0, 0.0], [100, 1.0]]), np.array([[0, 0.0], [50, 0.0], [100, 0.0]])]
-    figures.success_curves({"latent": seeds}, title="T")
-    lines = drawn[0].axes[0].lines
-    assert_allclose(lines[2].get_xydata(), [[0, 0.0], [50, 0.25], [100, 0.5]])
-    assert_allclose(lines[0].get_xydata(), seeds[0])
+def test_colors_follow_task_and_distance() -> None:
+    data = make_embeddings()
+    swapped = (data.task + 1) % 6
+    latent = data.task_latent
+    assert embedding_scatter(latent, data.task, NAMES) != embedding_scatter(latent, swapped, NAMES)
+    assert trajectories(latent, data.episode, data.distance) != trajectories(
+        latent, data.episode, data.distance[::-1]
+    )
 
 
-def test_trajectories_are_seen_with_the_robots_left_to_the_left(drawn: list[Any]) -> None:
-    paths = np.array([[[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]])
-    figures.behaviour_trajectories({"straight": paths}, {"straight": np.array([[0.5]])})
-    above, behind = drawn[0].axes[:2]
-    assert above.xaxis_inverted()
-    assert behind.xaxis_inverted()
-    assert_allclose(above.collections[1].get_offsets(), [[0.2, 0.1], [0.5, 0.4]])
-    assert_allclose(behind.collections[1].get_offsets(), [[0.2, 0.3], [0.5, 0.6]])
+@pytest.mark.parametrize("dim", [1, 3])
+def test_embeddings_of_other_sizes_are_drawn(dim: int) -> None:
+    data = make_embeddings(dim)
+    for image in (
+        embedding_scatter(data.task_latent, data.task, NAMES),
+        embedding_tsne(data.task_latent[:40], data.task[:40], NAMES),
+        trajectories(data.task_latent, data.episode, data.distance),
+        trajectories(
+            data.task_latent, data.episode, data.distance, success_point=data.task_latent[0]
+        ),
+        embedding_stages(data.task_latent[:40], data.phase[:40], data.phase[:40], ("a", "b", "c")),
+        embedding_paths(
+            data.task_latent, data.task, NAMES, {"curve": [data.task_latent]}, np.eye(1, dim)
+        ),
+    ):
+        assert image.startswith(b"\x89PNG")
 
 
-def test_straight_paths_are_dashed_and_others_solid(drawn: list[Any]) -> None:
-    paths = {"straight": [np.eye(2)], "curve": [2 * np.eye(2)]}
-    embedding_figures.embedding_paths(np.eye(2), np.array([0, 1]), ["A", "B"], paths, np.eye(1, 2))
-    styles = {
-        tuple(line.get_xydata().ravel()): line.get_linestyle() for line in drawn[0].axes[0].lines
-    }
-    assert styles[1.0, 0.0, 0.0, 1.0] == "--"
-    assert styles[2.0, 0.0, 0.0, 2.0] == "-"
+def test_figures_refuse_what_they_cannot_draw() -> None:
+    with pytest.raises(BMRLError, match="no curve"):
+        stage1_curves({})
+    with pytest.raises(BMRLError, match=r"\[0, 6\).*7"):
+        embedding_scatter(np.zeros((1, 2)), np.array([7]), NAMES)
+    with pytest.raises(BMRLError, match="at least 4"):
+        embedding_tsne(np.zeros((3, 2)), np.zeros(3, dtype=int), NAMES)
+    with pytest.raises(BMRLError, match="no trajectory"):
+        trajectories(np.zeros((0, 2)), np.zeros(0, dtype=int), np.zeros(0))
+    with pytest.raises(BMRLError, match="no trajectory"):
+        behaviour_trajectories({}, {})
 
 
-def test_groups_take_the_colours_of_the_phases_that_they_share_most_with(drawn: list[Any]) -> None:
-    points = np.random.default_rng(0).normal(size=(12, 2))
-    phase = np.arange(12) % 3
-    group = np.array([1, 2, 0])[phase]  # the same groups under other numbers
-    embedding_figures.embedding_stages(points, phase, group, ["a", "b", "c"])
-    left, right = (axes.collections[0].get_facecolors() for axes in drawn[0].axes[:2])
-    assert_allclose(left, right)
-    assert len(np.unique(left, axis=0)) == 3
+@pytest.mark.parametrize(
+    ("returns", "expert", "low", "high"),
+    [
+        ([-5.0, -1.0], None, -5.0, 0.0),
+        ([-5.0, -1.0], -20.0, -20.0, 0.0),
+        ([198.0, 198.1], None, 0.0, 198.1),
+        ([300.0, 310.0], 400.0, 0.0, 400.0),
+    ],
+)
+def test_the_axes_of_curves_include_zero_and_have_a_margin_around_the_returns(
+    returns: list[float],
+    expert: float | None,
+    low: float,
+    high: float,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drawn: list[Any] = []
+    monkeypatch.setattr("torchrl_bmrl.reports.figures.png", lambda figure: drawn.append(figure))
+    expert_means = None if expert is None else {"still": expert}
+    stage1_curves({"still": [(1, 10, np.array(returns))]}, expert_means=expert_means)
+    bottom, top = drawn[0].axes[0].get_ylim()
+    margin = 0.03 * (high - low)
+    assert bottom == 0 if low == 0 else bottom < low - margin
+    assert top == 0 if high == 0 else top > high + margin

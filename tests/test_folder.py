@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -247,16 +248,21 @@ def test_of_two_runs_that_create_a_folder_at_once_one_does_and_the_other_is_chec
     assert read_settings(tmp_path / "other") == SETTINGS
 
 
-@pytest.mark.parametrize("text", [None, "a: [1", "- 1\n- 2\n", ""])
-def test_a_folder_without_readable_settings_is_refused_by_name(
-    tmp_path: Path, text: str | None
+@pytest.mark.parametrize(
+    ("name", "read", "text"),
+    [
+        *(("config.yaml", read_settings, text) for text in (None, "a: [1", "- 1\n- 2\n", "")),
+        *(("versions.json", read_versions, text) for text in (None, "{", "", "[1, 2]")),
+    ],
+)
+def test_a_folder_without_readable_settings_or_versions_is_refused_by_name(
+    tmp_path: Path, name: str, read: Callable[[Path], Any], text: str | None
 ) -> None:
-    path = tmp_path / "config.yaml"
     if text is not None:
-        path.write_text(text)
+        (tmp_path / name).write_text(text)
     with pytest.raises(DataError) as info:
-        read_settings(tmp_path)
-    assert info.value.path == path
+        read(tmp_path)
+    assert info.value.path == tmp_path / name
 
 
 def test_settings_that_refer_to_each_other_are_refused_before_they_grow(tmp_path: Path) -> None:
@@ -275,18 +281,6 @@ def test_settings_and_versions_of_any_content_are_refused_by_name(
         (tmp_path / name).write_bytes(text.encode("utf-8", "surrogateescape"))
         with pytest.raises(DataError, match=name):
             read(tmp_path)
-
-
-@pytest.mark.parametrize("text", [None, "{", "", "[1, 2]"])
-def test_a_folder_without_readable_versions_is_refused_by_name(
-    tmp_path: Path, text: str | None
-) -> None:
-    path = tmp_path / "versions.json"
-    if text is not None:
-        path.write_text(text)
-    with pytest.raises(DataError) as info:
-        read_versions(tmp_path)
-    assert info.value.path == path
 
 
 @pytest.mark.parametrize("name", ["", "missing.yaml"])

@@ -18,6 +18,13 @@ from torchrl_bmrl.run import loggers
 from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
 
 
+@pytest.fixture
+def offline_wandb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs wandb without an account or a server; its own files go to ``home``."""
+    pytest.importorskip("wandb")
+    offline(monkeypatch, tmp_path / "home")
+
+
 def test_no_logger_logs_nothing(tmp_path: Path) -> None:
     assert make_logger("none", tmp_path, "bcq_lift") is None
     log_metrics(None, {"loss": torch.tensor(1.0)}, 1)
@@ -45,11 +52,10 @@ def test_tensorboard_writes_events_in_the_run_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("offline_wandb")
 def test_every_wandb_logger_of_a_process_has_a_run_of_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("wandb")
-    offline(monkeypatch, tmp_path / "home")
     monkeypatch.chdir(tmp_path)
     names = ["bcq_reach", "bcq_lift", "distill"]
     made = {name: make_logger("wandb", tmp_path / "run", name) for name in names}
@@ -70,11 +76,10 @@ def test_every_wandb_logger_of_a_process_has_a_run_of_its_own(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("offline_wandb")
 def test_a_run_that_goes_on_continues_its_own_wandb_run_whatever_a_batch_script_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("wandb")
-    offline(monkeypatch, tmp_path / "home")
     monkeypatch.setenv("WANDB_RUN_ID", "one-for-all")
     for step in (0, 20):
         for folder in ("a", "b"):

@@ -15,7 +15,7 @@ pytest.importorskip("robosuite", exc_type=ImportError)
 pytest.importorskip("h5py")
 
 import h5py
-from episode_files import OBSERVATION_SHAPES
+from observations import OBSERVATION_SHAPES
 
 from torchrl_bmrl.envs.skills import Lift
 from torchrl_bmrl.experts.collect import collect_demonstrations

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -127,3 +128,55 @@ def test_pictures_may_be_larger_than_mujocos_own_buffer(library: str) -> None:
     env.reset(seed=0)
     assert env.render().shape == (720, 960, 3)
     env.close()
+
+
+RENDER = """
+import sys
+import mujoco
+try:
+    renderer = mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 32, 32)
+    renderer.close()
+except BaseException as error:
+    print(f"{type(error).__name__}: {error}")
+    sys.exit(77)
+import numpy as np
+from torchrl_bmrl.envs.tabletop import TabletopEnv
+env = TabletopEnv("reach", render_mode="rgb_array", image_size=(256, 320))
+env.reset(seed=1)
+shown = env.render()
+again = env.render()
+env.robosuite_env.sim.model.site_rgba[env.robosuite_env._goal_site_id] = 0.0
+hidden = env.render()
+np.savez(sys.argv[1], shown=shown, again=again, hidden=hidden)
+env.close()
+"""
+
+
+def test_the_goal_marker_is_visible_in_the_picture(tmp_path: Path) -> None:
+    # A new process, because mujoco reads MUJOCO_GL when it is first imported.
+    environment = {"MUJOCO_GL": "egl", **os.environ}
+    done = subprocess.run(
+        [sys.executable, "-c", RENDER, str(tmp_path / "pictures.npz")],
+        env=environment,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    if done.returncode == 77:
+        pytest.skip(f"MUJOCO_GL={environment['MUJOCO_GL']} cannot render: {done.stdout.strip()}")
+    assert done.returncode == 0, done.stderr
+    with np.load(tmp_path / "pictures.npz") as file:
+        shown, again, hidden = file["shown"], file["again"], file["hidden"]
+    assert shown.shape == (256, 320, 3)
+    assert shown.dtype == np.uint8
+    assert np.ptp(hidden) > 50  # a scene, not a blank page
+    np.testing.assert_array_equal(shown, again)
+    difference = np.abs(shown.astype(int) - hidden).max(-1)
+    rows, columns = np.nonzero(difference > 40)
+    assert len(rows) > 15
+    assert max(np.ptp(rows), np.ptp(columns)) < 15  # one spot
+
+
+def test_without_render_mode_there_is_no_picture(envs: dict[str, TabletopEnv]) -> None:
+    assert envs["reach"].render() is None

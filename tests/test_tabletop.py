@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,14 +21,6 @@ pytestmark = pytest.mark.robosuite
 ACTIONS = np.random.default_rng(0).uniform(-1, 1, (60, 7))
 ACTIONS[:, 2] -= 0.6  # down: fingers, cube and table touch
 ACTIONS[:, 6] = np.sign(np.sin(np.arange(60)))  # the gripper is never at rest
-
-
-@pytest.fixture(scope="module")
-def envs() -> Iterator[dict[str, TabletopEnv]]:
-    made = {task: TabletopEnv(task) for task in ("reach", "lift", "push_left")}
-    yield made
-    for env in made.values():
-        env.close()
 
 
 def rows(env: TabletopEnv, actions: np.ndarray) -> np.ndarray:

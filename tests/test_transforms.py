@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("gymnasium")
 
 import torch
+from observations import OBSERVATION_SHAPES
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import Composite, Unbounded
@@ -27,15 +28,6 @@ from torchrl_bmrl.tasks import get_task
 
 TASK = get_task("push_left")
 
-SIZES = {
-    "robot0_joint_pos": 7,
-    "robot0_gripper_qpos": 2,
-    "robot0_joint_vel": 7,
-    "robot0_eef_pos": 3,
-    "robot0_eef_quat": 4,
-    "goal_pos": 3,
-}
-
 
 def random_episodes(
     count: int, *, seed: int, loc: float = 0.0, scale: float = 1.0
@@ -43,7 +35,10 @@ def random_episodes(
     rng = np.random.default_rng(seed)
 
     def parts() -> dict[str, np.ndarray]:
-        return {name: loc + scale * rng.standard_normal((6, size)) for name, size in SIZES.items()}
+        return {
+            name: loc + scale * rng.standard_normal((6, size))
+            for name, size in OBSERVATION_SHAPES.items()
+        }
 
     return [
         Episode(
@@ -60,7 +55,7 @@ def random_episodes(
 def raw_observation(parts: dict[str, np.ndarray]) -> np.ndarray:
     """``observation`` as the documentation spells it."""
     joints = parts["robot0_joint_pos"]
-    names = list(SIZES)[1:]
+    names = list(OBSERVATION_SHAPES)[1:]
     return np.concatenate([np.sin(joints), np.cos(joints), *(parts[n] for n in names)], axis=-1)
 
 
@@ -101,7 +96,7 @@ def test_observation_is_33_numbers_in_the_documented_order() -> None:
     expected = torch.as_tensor(raw_observation(episode.observations)).float()
     assert out["observation"].shape == (6, 33)
     torch.testing.assert_close(out["observation"], expected)
-    assert not set(SIZES) & set(out.keys())
+    assert not set(OBSERVATION_SHAPES) & set(out.keys())
 
 
 def test_stored_transitions_are_normalised_now_and_next() -> None:
@@ -184,7 +179,7 @@ def test_data_and_environment_give_the_same_observation_for_the_same_episode() -
         shown.append(parts)
         rewards.append(reward)
     env.close()
-    stacked = {name: np.stack([parts[name] for parts in shown]) for name in SIZES}
+    stacked = {name: np.stack([parts[name] for parts in shown]) for name in OBSERVATION_SHAPES}
     episode = Episode(
         observations={name: part[:-1] for name, part in stacked.items()},
         next_observations={name: part[1:] for name, part in stacked.items()},
