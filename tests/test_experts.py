@@ -112,6 +112,20 @@ def test_an_expert_starts_over_after_reset(envs: dict[str, TabletopEnv], task: s
     np.testing.assert_array_equal(again, first)
 
 
+@pytest.mark.parametrize("task", ["lift", "push_left"])
+def test_an_expert_that_loses_the_cube_starts_over(envs: dict[str, TabletopEnv], task: str) -> None:
+    scene = envs[task].robosuite_env
+    envs[task].reset(seed=0)
+    expert = make_expert(scene)
+    while expert.phase < 2:
+        envs[task].step(expert())
+    place = scene.goal_start + np.array([0.08, 0.0, 0.0])  # beside the gripper
+    scene.sim.data.set_joint_qpos(scene.cube.joints[0], np.append(place, [1.0, 0, 0, 0]))
+    scene.sim.forward()
+    expert()
+    assert expert.phase == 0
+
+
 def record(name: str, seed: int, *, horizon: int, **options: Any) -> Episode:
     task = make_task(SKILLS[name], EXPERTS[type(SKILLS[name])], horizon=horizon)
     return task.record(seed, **options, **task.options)  # type: ignore[misc]

@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("robosuite", exc_type=ImportError)
 
 import robosuite
+from robosuite.models.grippers import gripper_factory
 
 from torchrl_bmrl.envs.shortcuts import take_shortcuts
 
@@ -108,15 +109,12 @@ def test_distances_to_bodies_sites_and_geoms_are_robosuites(lift: Any) -> None:
                 )
 
 
-def test_a_new_model_brings_its_own_gripper() -> None:
-    env = make("Lift")
-    touch(env, 0.0)
-    assert env._check_grasp(env.robots[0].gripper, env.cube)
-    env.robots[0].gripper["right"].important_geoms["left_fingerpad"].clear()
-    env.reset()  # hard: another gripper
-    touch(env, 0.0)
-    assert env._check_grasp(env.robots[0].gripper, env.cube)
-    env.close()
+def test_another_gripper_is_looked_at_anew(lift: Any) -> None:
+    touch(lift, 0.0)
+    assert lift._check_grasp(lift.robots[0].gripper, lift.cube)
+    absent = gripper_factory("RethinkGripper", idn="absent")
+    assert not lift._check_grasp(absent, lift.cube)
+    assert lift._check_grasp(lift.robots[0].gripper, lift.cube)
 
 
 def test_the_markers_that_are_left_are_robosuites() -> None:
