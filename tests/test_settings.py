@@ -16,7 +16,7 @@ pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
-from torchrl_bmrl.pipeline import Run, Settings
+from torchrl_bmrl.pipeline import BCQSettings, CollectSettings, EvaluateSettings, Run, Settings
 from torchrl_bmrl.run.settings import check_settings, setting
 
 
@@ -168,6 +168,29 @@ def test_settings_that_do_not_fit_together_are_refused(changes: dict[str, Any], 
         setattr(getattr(settings, groups[0]) if groups else settings, last, value)
     with pytest.raises(BMRLError, match=says):
         settings.check()
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"only": 0}, "only is 0; valid: a list"),
+        ({"bcq": BCQSettings(num_cells=4)}, "bcq.num_cells is 4; valid: a list"),
+        ({"collect": CollectSettings(after=1)}, "collect.after is 1; valid: a mapping"),
+        (
+            {"collect": CollectSettings(after={"lift": 1})},
+            "collect.after.lift is 1; valid: a list",
+        ),
+        (
+            {"evaluate": EvaluateSettings(latent_sources=3)},
+            "evaluate.latent_sources is 3; valid: a list",
+        ),
+    ],
+)
+def test_a_number_where_a_list_or_a_mapping_belongs_is_refused_by_name(
+    changes: dict[str, Any], says: str
+) -> None:
+    with pytest.raises(ConfigError, match=re.escape(says)):
+        Settings(**changes).check()
 
 
 def test_the_device_may_be_missing_where_nothing_is_trained() -> None:

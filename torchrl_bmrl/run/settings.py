@@ -6,7 +6,8 @@ import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from operator import ge, gt, le
-from typing import Any
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 from torchrl_bmrl.errors import ConfigError, UnknownNameError
 
@@ -74,12 +75,36 @@ def check_settings(settings: Any, prefix: str = "") -> None:
         ...     kind: str = setting("a", choices=("a", "b"))
         >>> check_settings(Small())
     """
+    types = get_type_hints(type(settings))
     for field in dataclasses.fields(settings):
         name, value = f"{prefix}{field.name}", getattr(settings, field.name)
+        _check_container(name, value, types[field.name])
         if dataclasses.is_dataclass(value):
             check_settings(value, f"{name}.")
         elif field.metadata:
             _check(name, value, field.metadata)
+
+
+def _check_container(name: str, value: Any, kind: Any) -> None:
+    """Checks that a list is one, and a mapping; a reference to another setting may give a number.
+
+    Other types are left to the limits, to the choices and to Hydra.
+    """
+    if get_origin(kind) is UnionType:
+        if value is None:
+            return
+        (kind,) = (each for each in get_args(kind) if each is not type(None))
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin in (list, tuple):
+        if not isinstance(value, list | tuple):
+            raise ConfigError(f"{name} is {value!r}; valid: a list")
+        for item in value:
+            _check_container(name, item, arguments[0])
+    elif origin is dict:
+        if not isinstance(value, Mapping):
+            raise ConfigError(f"{name} is {value!r}; valid: a mapping")
+        for key, item in value.items():
+            _check_container(f"{name}.{key}", item, arguments[1])
 
 
 def _check(name: str, value: Any, valid: Mapping[str, Any]) -> None:
