@@ -25,6 +25,7 @@ from episode_files import make_episode, write_file
 
 from torchrl_bmrl.data.importing import read_original_bounds
 from torchrl_bmrl.data.robomimic import write_episodes
+from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
 from torchrl_bmrl.files import read_rows
 from torchrl_bmrl.modules import BCQPolicy, prototype
@@ -210,6 +211,16 @@ def test_held_out_numbers_are_those_of_the_demonstrations_and_computed_once(
         _, seen = policies[2 * index + 1]
         for part in (seen, seen["next"]):
             assert (part["task_latent"] == student.prototypes[index]).all()
+
+
+def test_held_out_numbers_of_a_run_on_a_device_that_is_not_here_are_refused_by_name(
+    trained: Path, tmp_path: Path
+) -> None:
+    run = distilled(trained, tmp_path)
+    with run:
+        run.settings.device = "cuda:99"
+        with pytest.raises(ConfigError, match=r"device is 'cuda:99'; valid: one that torch"):
+            evaluate_held_out(run)
 
 
 def record(seed: int, *, noise: float, **options: Any) -> Any:

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
+from torchrl_bmrl.data.replay import check_device
 from torchrl_bmrl.evaluation.fitted_q import estimate_return
 from torchrl_bmrl.files import finite, read_rows, write_rows
 from torchrl_bmrl.modules import BCQPolicy
@@ -46,7 +47,11 @@ def evaluate_held_out(run: Run) -> Table:
 
     Returns:
         the numbers of every task.
+
+    Raises:
+        ConfigError: if the run's device, which the estimates are trained on, is not here.
     """
+    check_device(run.settings.device)
     log.warning("some tasks have no environment: held-out losses and estimates instead of returns")
     updates = _critic_updates(run)
     rows = run.jobs(
