@@ -131,12 +131,18 @@ def test_a_stored_seed_reproduces_its_episode(collected: dict[str, Path]) -> Non
 
 @pytest.fixture
 def patch_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Code that worker processes run when they start."""
+    """Code that worker processes run when they start, and the processes that they start do not.
+
+    Importing TorchRL imports mujoco, whose glfw asks another Python for its version; with the code
+    in that one, too, each process would start the next.
+    """
 
     def patch(code: str) -> None:
         monkeypatch.setenv("PYTHONPATH", str(tmp_path / "patch"), prepend=os.pathsep)
         (tmp_path / "patch").mkdir()
-        (tmp_path / "patch" / "sitecustomize.py").write_text(code)
+        (tmp_path / "patch" / "sitecustomize.py").write_text(
+            f"import os\nos.environ.pop('PYTHONPATH')\n{code}"
+        )
 
     return patch
 
