@@ -82,6 +82,9 @@ QUOTED = [
 """Text between single backticks, outside blocks of code."""
 
 
+@pytest.mark.skipif(
+    not (ROOT / "torchrl_bmrl").exists(), reason="the package's sources are not beside the tests"
+)
 def test_files_that_a_page_quotes_exist() -> None:
     pattern = r"(?:python )?((?:recipes|docs|tests|torchrl_bmrl|\.ci)/[\w./-]*)"
     found = [(page, found[1]) for page, text in QUOTED if (found := re.match(pattern, text))]
