@@ -18,7 +18,9 @@ has ``latent_dim`` and ``decode(tensordict, keys)``, which PLAS and the distilla
 has ``sizes`` (key to size) or ``bounds`` (of its actions), the losses compare these with the other
 networks and with their own bounds.
 
-:class:`Autoencoder` is the generator of the published algorithms.
+:class:`Autoencoder` is the generator of the published algorithms. :class:`LatentGenerator` is the
+base of it and of :class:`torchrl_bmrl.modules.ActionFlow` and
+:class:`torchrl_bmrl.modules.ActionMixture`.
 """
 
 from __future__ import annotations
@@ -64,7 +66,84 @@ class ActionKeys:
     action_latent_scale: NestedKey = "action_latent_scale"
 
 
-class Autoencoder(TensorDictModuleBase):
+class LatentGenerator(TensorDictModuleBase):
+    """Base of generators whose action is a function of the state and a latent z ~ N(0, I).
+
+    A subclass adds ``metrics`` and ``row_loss``, and ``options`` if it takes some.
+
+    Args:
+        decoder: (observation, ``action_latent`` → action).
+        latent_dim: size of z.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_bmrl.modules import make_decoder
+        >>> generator = LatentGenerator(make_decoder(3, 2, 4), latent_dim=4)  # as in a subclass
+        >>> state = TensorDict({"observation": torch.zeros(5, 3)}, [5])
+        >>> generator.propose(state, 10, ActionKeys())["action"].shape
+        torch.Size([5, 10, 2])
+    """
+
+    options: tuple[str, ...] = ()
+
+    decoder: TensorDictModule
+
+    def __init__(self, decoder: TensorDictModule, latent_dim: int) -> None:
+        super().__init__()
+        self.decoder = decoder
+        self.latent_dim = latent_dim
+        self.out_keys = list(decoder.out_keys)
+
+    @property
+    def sizes(self) -> dict[NestedKey, int]:
+        """Sizes of the entries, as far as the decoder declares them."""
+        return dict(getattr(self.decoder, "sizes", {}))
+
+    @property
+    def bounds(self) -> tuple[Tensor, Tensor] | None:
+        """Bounds of the actions, if the decoder declares them."""
+        return getattr(self.decoder, "bounds", None)
+
+    def propose(
+        self,
+        observation: TensorDictBase,
+        num_candidates: int,
+        keys: ActionKeys,
+        *,
+        latent_clip: Any = None,
+    ) -> TensorDictBase:
+        """Actions decoded from z ~ N(0, I), with a new draw for every candidate.
+
+        Args:
+            observation: what the decoder reads beside z, batch ``[*B]``.
+            num_candidates: actions for each state.
+            keys: names of the entries.
+            latent_clip: bound on each dimension of z, ``None`` for none.
+
+        Returns:
+            batch ``[*B, num_candidates]`` with the observation, z and the action.
+        """
+        weight = next(self.decoder.parameters())
+        return decode_draws(
+            self.decoder, observation, num_candidates, self.latent_dim, keys, latent_clip, weight
+        )
+
+    def decode(self, tensordict: TensorDictBase, keys: ActionKeys) -> TensorDictBase:
+        """The data with the action decoded from the latent.
+
+        Args:
+            tensordict: observation and z, batch ``[*B]``; the action is written into it.
+            keys: names of the entries.
+
+        Raises:
+            BMRLError: if the decoder writes another key than the action's.
+        """
+        data = self.decoder(tensordict)
+        written(data, keys.action, self.decoder)
+        return data
+
+
+class Autoencoder(LatentGenerator):
     r"""Conditional variational autoencoder of the data's actions.
 
     Reference: Kingma and Welling, *Auto-Encoding Variational Bayes*, ICLR 2014,
@@ -90,29 +169,18 @@ class Autoencoder(TensorDictModuleBase):
     options = (*LOSS_OPTIONS, *PROPOSAL_OPTIONS)
 
     encoder: TensorDictModule
-    decoder: TensorDictModule
 
     def __init__(
         self, encoder: TensorDictModule, decoder: TensorDictModule, latent_dim: int
     ) -> None:
-        super().__init__()
+        super().__init__(decoder, latent_dim)
         self.encoder = encoder
-        self.decoder = decoder
-        self.latent_dim = latent_dim
-        action = list(decoder.out_keys)
-        self.in_keys = [key for key in encoder.in_keys if key not in action]
-        self.out_keys = action
+        self.in_keys = [key for key in encoder.in_keys if key not in decoder.out_keys]
 
     @property
     def sizes(self) -> dict[NestedKey, int]:
         """Sizes of the entries, as far as encoder and decoder declare them."""
-        parts = (self.encoder, self.decoder)
-        return {k: size for part in parts for k, size in getattr(part, "sizes", {}).items()}
-
-    @property
-    def bounds(self) -> tuple[Tensor, Tensor] | None:
-        """Bounds of the actions, if the decoder declares them."""
-        return getattr(self.decoder, "bounds", None)
+        return dict(getattr(self.encoder, "sizes", {})) | super().sizes
 
     def row_loss(
         self, tensordict: TensorDictBase, keys: ActionKeys, *, kl_weight: Any, kl_reduction: str
@@ -152,30 +220,6 @@ class Autoencoder(TensorDictModuleBase):
         metrics = {"reconstruction_error": error, "kl_divergence": divergence}
         return error + kl_weight * divergence, metrics
 
-    def propose(
-        self,
-        observation: TensorDictBase,
-        num_candidates: int,
-        keys: ActionKeys,
-        *,
-        latent_clip: Any,
-    ) -> TensorDictBase:
-        """Actions decoded from z ~ N(0, I), with a new draw for every candidate.
-
-        Args:
-            observation: what the decoder reads beside z, batch ``[*B]``.
-            num_candidates: actions for each state.
-            keys: names of the entries.
-            latent_clip: bound on each dimension of z, ``None`` for none.
-
-        Returns:
-            batch ``[*B, num_candidates]`` with the observation, z and the action.
-        """
-        weight = next(self.decoder.parameters())
-        return decode_draws(
-            self.decoder, observation, num_candidates, self.latent_dim, keys, latent_clip, weight
-        )
-
     def encode(self, tensordict: TensorDictBase, keys: ActionKeys) -> TensorDictBase:
         """The data with mean and standard deviation of the posterior of z.
 
@@ -189,20 +233,6 @@ class Autoencoder(TensorDictModuleBase):
         data = self.encoder(tensordict.copy())
         for key in (keys.action_latent_loc, keys.action_latent_scale):
             written(data, key, self.encoder)
-        return data
-
-    def decode(self, tensordict: TensorDictBase, keys: ActionKeys) -> TensorDictBase:
-        """The data with the action decoded from the latent.
-
-        Args:
-            tensordict: observation and z, batch ``[*B]``; the action is written into it.
-            keys: names of the entries.
-
-        Raises:
-            BMRLError: if the decoder writes another key than the action's.
-        """
-        data = self.decoder(tensordict)
-        written(data, keys.action, self.decoder)
         return data
 
 

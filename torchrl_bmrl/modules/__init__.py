@@ -2,6 +2,7 @@
 
 from torchrl_bmrl.modules.demonstration_latent import DemonstrationTaskLatent
 from torchrl_bmrl.modules.discrete_policy import DiscreteBCQPolicy
+from torchrl_bmrl.modules.flow import ActionFlow
 from torchrl_bmrl.modules.following import LossPolicy, extract_critic, extract_network
 from torchrl_bmrl.modules.generator import (
     ActionVAE,
@@ -11,6 +12,7 @@ from torchrl_bmrl.modules.generator import (
     make_qvalue_network,
 )
 from torchrl_bmrl.modules.latent_action import HeldTaskLatent, task_latent_box
+from torchrl_bmrl.modules.mixture import ActionMixture
 from torchrl_bmrl.modules.policy import BCQPolicy, PLASPolicy
 from torchrl_bmrl.modules.task_latent import (
     OnlineTaskLatent,
@@ -24,6 +26,8 @@ from torchrl_bmrl.modules.task_latent import (
 )
 
 __all__ = [
+    "ActionFlow",
+    "ActionMixture",
     "ActionVAE",
     "BCQPolicy",
     "DemonstrationTaskLatent",

@@ -97,7 +97,7 @@ class Network(TensorDictModule):
     def bounds(self) -> tuple[Tensor, Tensor] | None:
         """Bounds of its output, ``None`` where it has none."""
         module = self.module
-        return (module.low, module.high) if isinstance(module, _BoundedDecoder) else None
+        return (module.low, module.high) if isinstance(module, BoundedModule) else None
 
     def _write_to_tensordict(
         self,
@@ -116,15 +116,23 @@ class Network(TensorDictModule):
         return tensordict
 
 
-def _sized(
+def sized(
     module: nn.Module, reads: Mapping[NestedKey, int], writes: Mapping[NestedKey, int]
 ) -> Network:
     """A network for entries of known sizes."""
     return Network(module, list(reads), list(writes), {**reads, **writes})
 
 
-def make_mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> MLP:
+def make_mlp(
+    in_features: int, out_features: int, num_cells: Sequence[int], *, layer_norm: bool = False
+) -> MLP:
     """ReLU network whose inputs are concatenated along the last dimension.
+
+    Args:
+        in_features: size of all inputs together.
+        out_features: size of the output.
+        num_cells: widths of the hidden layers.
+        layer_norm: whether each hidden layer is normalised before its activation.
 
     Example:
         >>> make_mlp(3, 2, (8,))(torch.zeros(5, 1), torch.zeros(5, 2)).shape
@@ -136,6 +144,8 @@ def make_mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> M
         num_cells=list(num_cells),
         activation_class=nn.ReLU,
         activation_kwargs={"inplace": True},
+        norm_class=nn.LayerNorm if layer_norm else None,
+        norm_kwargs=[{"normalized_shape": width} for width in num_cells] if layer_norm else None,
     )
 
 
@@ -151,11 +161,37 @@ class _Posterior(nn.Module):
         return loc, log_scale.clamp(-4.0, 15.0).exp()
 
 
-class _BoundedDecoder(nn.Module):
-    """Network whose output is squashed into the action's bounds."""
+class BoundedModule(nn.Module):
+    """Module whose output lies within the action's bounds.
+
+    Args:
+        bounds: lower and upper bound, numbers or ``(action_dim,)``.
+
+    Example:
+        >>> BoundedModule((-1.0, 1.0)).scaled(torch.tensor([0.5, 2.0]))
+        tensor([0.5000, 1.0000])
+    """
 
     low: Tensor
     high: Tensor
+
+    def __init__(self, bounds: tuple[float | Tensor, float | Tensor]) -> None:
+        super().__init__()
+        low, high = (torch.as_tensor(x, dtype=torch.get_default_dtype()) for x in bounds)
+        self.register_buffer("low", low)
+        self.register_buffer("high", high)
+
+    def scaled(self, unit: Tensor) -> Tensor:
+        """Maps [-1, 1] to the bounds; clamps what lies outside."""
+        return self.low + (self.high - self.low) * (0.5 * (unit.clamp(-1.0, 1.0) + 1.0))
+
+    def unscaled(self, action: Tensor) -> Tensor:
+        """Maps the bounds to [-1, 1]."""
+        return 2.0 * (action - self.low) / (self.high - self.low) - 1.0
+
+
+class _BoundedDecoder(BoundedModule):
+    """Network whose output is squashed into the action's bounds."""
 
     def __init__(
         self,
@@ -164,11 +200,8 @@ class _BoundedDecoder(nn.Module):
         num_cells: Sequence[int],
         bounds: tuple[float | Tensor, float | Tensor],
     ) -> None:
-        super().__init__()
+        super().__init__(bounds)
         self.network = make_mlp(in_features, action_dim, num_cells)
-        low, high = (torch.as_tensor(x, dtype=torch.get_default_dtype()) for x in bounds)
-        self.register_buffer("low", low)
-        self.register_buffer("high", high)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         unit = 0.5 * (self.network(*inputs).tanh() + 1.0)
@@ -215,7 +248,7 @@ class ActionVAE(Autoencoder):
         observation_key: NestedKey = "observation",
     ) -> None:
         size = 2 * action_dim if latent_dim is None else latent_dim
-        encoder = _sized(
+        encoder = sized(
             _Posterior(observation_dim + action_dim, size, num_cells),
             {observation_key: observation_dim, "action": action_dim},
             {"action_latent_loc": size, "action_latent_scale": size},
@@ -275,7 +308,7 @@ def make_decoder(
         sizes["task_latent"] = task_latent_dim
     network = _BoundedDecoder(sum(sizes.values()), action_dim, num_cells, bounds)
     reads = dict(zip(sizes if in_keys is None else in_keys, sizes.values(), strict=True))
-    return _sized(network, reads, {"action": action_dim})
+    return sized(network, reads, {"action": action_dim})
 
 
 def make_qvalue_network(
@@ -284,6 +317,7 @@ def make_qvalue_network(
     *,
     task_latent_dim: int = 0,
     num_cells: Sequence[int] = (256, 256),
+    layer_norm: bool = False,
 ) -> TensorDictModule:
     """Critic from observation, action and, with ``task_latent_dim``, ``task_latent``.
 
@@ -294,6 +328,8 @@ def make_qvalue_network(
         action_dim: size of the action.
         task_latent_dim: size of ``task_latent``; 0 for a critic without this input.
         num_cells: widths of the hidden layers.
+        layer_norm: whether each hidden layer is normalised, which bounds the values of actions
+            that the data do not contain (https://arxiv.org/abs/2302.02948).
 
     Example:
         >>> make_qvalue_network(3, 2).in_keys
@@ -302,8 +338,8 @@ def make_qvalue_network(
     reads = {"observation": observation_dim, "action": action_dim}
     if task_latent_dim:
         reads["task_latent"] = task_latent_dim
-    network = make_mlp(sum(reads.values()), 1, num_cells)
-    return _sized(network, reads, {"state_action_value": 1})
+    network = make_mlp(sum(reads.values()), 1, num_cells, layer_norm=layer_norm)
+    return sized(network, reads, {"state_action_value": 1})
 
 
 class _Tanh(nn.Module):
@@ -334,7 +370,7 @@ def make_perturbation_network(
     """
     network = _Tanh(make_mlp(observation_dim + action_dim, action_dim, num_cells))
     reads = {"observation": observation_dim, "action": action_dim}
-    return _sized(network, reads, {"perturbation": action_dim})
+    return sized(network, reads, {"perturbation": action_dim})
 
 
 def make_latent_actor(
@@ -360,4 +396,4 @@ def make_latent_actor(
         ['action_latent']
     """
     network = _Tanh(make_mlp(observation_dim, latent_dim, num_cells), max_latent)
-    return _sized(network, {"observation": observation_dim}, {"action_latent": latent_dim})
+    return sized(network, {"observation": observation_dim}, {"action_latent": latent_dim})

@@ -131,7 +131,8 @@ class GenerativeLoss(OfflineLoss):
         self._refuse_unread(kl_weight=kl_weight, kl_reduction=kl_reduction, latent_clip=latent_clip)
         if "kl_weight" in generator.options:
             self.register_coefficients(kl_weight=kl_weight)
-        self.register_coefficients(latent_clip=latent_clip, optional=True)
+        clip = latent_clip if "latent_clip" in generator.options else None
+        self.register_coefficients(latent_clip=clip, optional=True)
 
     def _refuse_unread(self, **options: Any) -> None:
         """Raises for an option with another value than its default that the generator lacks."""

@@ -6,6 +6,7 @@ import math
 import re
 import reprlib
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,10 @@ from torch import Tensor, nn
 from torchrl.envs.transforms import Transform
 
 from torchrl_bmrl.errors import CheckpointError, UnknownNameError
+from torchrl_bmrl.generators import LatentGenerator
 from torchrl_bmrl.modules import (
+    ActionFlow,
+    ActionMixture,
     ActionVAE,
     BCQPolicy,
     DemonstrationTaskLatent,
@@ -36,12 +40,22 @@ _SIX_TASKS = {"observation_dim": 33, "action_dim": 7}
 """Sizes of older checkpoints, which do not contain them."""
 
 
+GENERATORS: dict[str, Callable[..., LatentGenerator]] = {
+    "autoencoder": ActionVAE,
+    "flow": ActionFlow,
+    "mixture": ActionMixture,
+}
+"""Generators of stage 1 by name."""
+
+
 def make_bcq_loss(
     *,
     observation_dim: int,
     action_dim: int,
     num_cells: Sequence[int] = (256, 256),
+    generator: str = "autoencoder",
     num_qvalue_nets: int = 2,
+    layer_norm: bool = False,
     perturbation: bool = False,
     **options: Any,
 ) -> BCQLoss:
@@ -51,21 +65,27 @@ def make_bcq_loss(
         observation_dim: size of the observation.
         action_dim: size of the action.
         num_cells: widths of the hidden layers of every network.
+        generator: name of the generator, of :data:`GENERATORS`.
         num_qvalue_nets: number of critics.
+        layer_norm: whether the critics' hidden layers are normalised.
         perturbation: whether there is a perturbation network.
         **options: options of :class:`BCQLoss`.
 
     Raises:
+        UnknownNameError: for another generator.
         BMRLError: for options that :class:`BCQLoss` refuses.
 
     Example:
         >>> make_bcq_loss(observation_dim=3, action_dim=2, num_cells=(8,)).num_qvalue_nets
         2
     """
+    if generator not in GENERATORS:
+        raise UnknownNameError("generator", generator, tuple(GENERATORS))
     dims = (observation_dim, action_dim)
+    critic = partial(make_qvalue_network, *dims, num_cells=num_cells, layer_norm=layer_norm)
     return BCQLoss(
-        ActionVAE(*dims, num_cells=num_cells),
-        [make_qvalue_network(*dims, num_cells=num_cells) for _ in range(num_qvalue_nets)],
+        GENERATORS[generator](*dims, num_cells=num_cells),
+        [critic() for _ in range(num_qvalue_nets)],
         make_perturbation_network(*dims, num_cells=num_cells) if perturbation else None,
         bounds=(-1.0, 1.0),
         **options,

@@ -35,6 +35,7 @@ NOT_OF_THE_LOSS = (
     "eval_episodes",
     "batch_size",
     "lr",
+    "n_steps",
     "tau",
     "generator_warmup",
     "critic_grad_clip",

@@ -12,7 +12,7 @@ from torchrl_bmrl.objectives.checks import check_value_bounds
 from torchrl_bmrl.objectives.common import LOSS_FUNCTIONS
 from torchrl_bmrl.objectives.distillation import CONTEXTS, ENCODER_TERMS
 from torchrl_bmrl.objectives.generative import KL_REDUCTIONS
-from torchrl_bmrl.pipeline.agents import LATENT_SOURCES, TASK_ENCODERS
+from torchrl_bmrl.pipeline.agents import GENERATORS, LATENT_SOURCES, TASK_ENCODERS
 from torchrl_bmrl.run.folder import deciding
 from torchrl_bmrl.run.loggers import LOGGERS
 from torchrl_bmrl.run.settings import check_settings, setting
@@ -57,13 +57,16 @@ class BCQSettings:
     batch_size: int = setting(128, above=0)  # transitions per update
     lr: float = setting(1e-3, above=0)  # learning rate of Adam
     num_cells: list[int] = setting([256, 256], above=0)  # widths of the hidden layers
+    generator: str = setting("autoencoder", choices=tuple(GENERATORS))  # model of the actions
     num_qvalue_nets: int = setting(2, above=0)  # critics of each agent
+    layer_norm: bool = False  # normalises the critics' hidden layers
     num_candidates: int = setting(10, above=0)  # proposals in the critics' target
     lmbda: float = setting(0.75, at_least=0, at_most=1)  # weight of the critics' minimum
     latent_clip: float | None = setting(0.5, above=0)  # null turns it off
     kl_weight: float = setting(0.5, at_least=0)  # weight of the KL term in the generator's loss
     kl_reduction: str = setting("mean", choices=KL_REDUCTIONS)  # reduction over the latent
     gamma: float = setting(0.99, at_least=0, at_most=1)  # discount factor
+    n_steps: int = setting(1, above=0)  # rewards in the critics' target
     tau: float = setting(0.005, above=0, at_most=1)  # update rate of the target networks
     perturbation: bool = False  # perturbation network; none in the paper
     max_perturbation: float = setting(0.05, at_least=0)  # bound on the perturbation

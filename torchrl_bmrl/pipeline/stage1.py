@@ -11,7 +11,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 
-from torchrl_bmrl.data import make_multi_task_replay_buffer, make_replay_buffer
+from torchrl_bmrl.data import NStep, make_multi_task_replay_buffer, make_replay_buffer
+from torchrl_bmrl.data.n_step import STEPS_KEY
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.modules import BCQPolicy
@@ -63,7 +64,7 @@ def stage1(run: Run) -> None:
 def train_job(job: tuple[Run, dict[str, str]], report: Report) -> None:
     """Trains agents (tasks by agent name) on their tasks' demonstrations."""
     run, agents = job
-    datasets = [run.transitions(task, "train") for task in agents.values()]
+    datasets = [training_data(run, task) for task in agents.values()]
     options: dict[str, Any] = {
         "batch_size": run.settings.bcq.batch_size,
         "device": run.settings.device,
@@ -73,6 +74,12 @@ def train_job(job: tuple[Run, dict[str, str]], report: Report) -> None:
     else:
         buffer = make_multi_task_replay_buffer(datasets, **options)
     train_agents(run, agents, buffer, report, sizes=sizes_of(datasets[0]))
+
+
+def training_data(run: Run, task: str) -> TensorDictBase:
+    """Returns a task's training data ``[N]``; each row sums up ``bcq.n_steps`` steps."""
+    bcq, data = run.settings.bcq, run.transitions(task, "train")
+    return data if bcq.n_steps == 1 else NStep(bcq.n_steps, bcq.gamma)(data)
 
 
 def sizes_of(data: TensorDictBase) -> dict[str, int]:
@@ -120,7 +127,7 @@ def train_agents(
 
             fit(
                 lambda update, batch: choose(update)(batch),
-                lambda: buffer.sample().select(*trained.loss.in_keys),
+                lambda: buffer.sample().select(*trained.loss.in_keys, STEPS_KEY, strict=False),
                 start=trained.updates,
                 total=total,
                 every=Every(
