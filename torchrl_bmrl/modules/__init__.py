@@ -2,6 +2,7 @@
 
 from torchrl_bmrl.modules.demonstration_latent import DemonstrationTaskLatent
 from torchrl_bmrl.modules.discrete_policy import DiscreteBCQPolicy
+from torchrl_bmrl.modules.ensemble import EnsembleCritic
 from torchrl_bmrl.modules.flow import ActionFlow
 from torchrl_bmrl.modules.following import LossPolicy, extract_critic, extract_network
 from torchrl_bmrl.modules.generator import (
@@ -32,6 +33,7 @@ __all__ = [
     "BCQPolicy",
     "DemonstrationTaskLatent",
     "DiscreteBCQPolicy",
+    "EnsembleCritic",
     "HeldTaskLatent",
     "LossPolicy",
     "OnlineTaskLatent",

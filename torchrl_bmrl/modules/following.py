@@ -16,6 +16,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.modules.ensemble import EnsembleCritic
 from torchrl_bmrl.ownership import is_copied
 
 if TYPE_CHECKING:
@@ -181,10 +182,10 @@ class Link:
     Args:
         module: the policy's own network.
         name: of the loss's network.
-        critic: index of the loss's critic; ``None`` for another network.
+        critic: for critics, the rule of :func:`.ensemble_value`; ``None`` for another network.
     """
 
-    def __init__(self, module: Any, name: str, critic: int | None) -> None:
+    def __init__(self, module: Any, name: str, critic: str | None) -> None:
         self.module, self.name, self.critic = module, name, critic
         params = TensorDict.from_module(module)
         self.keys = list(params.keys(include_nested=True, leaves_only=True))
@@ -196,16 +197,21 @@ class Link:
         return [params.get(key) for key in self.keys]
 
 
-def _held(loss: Any, name: str, critic: int | None) -> tuple[Any, TensorDictBase]:
-    """A loss's network and its parameters."""
+def _held(loss: Any, name: str, critic: str | None) -> tuple[Any, TensorDictBase]:
+    """A loss's network and its parameters; of critics the first, or all as one network."""
     if critic is not None and hasattr(loss, "critic"):
-        return loss.critic(critic)
+        if critic == "clipped":
+            return loss.critic(0)
+        modules, params = zip(*map(loss.critic, range(loss.num_qvalue_nets)), strict=True)
+        own = {str(i): each for i, each in enumerate(params)}
+        copies = [deepcopy(module) for module in modules]  # a stack has one module for all
+        return EnsembleCritic(copies, critic), TensorDict({"critics": own})
     params = getattr(loss, f"{name}_params")
     return getattr(loss, name), getattr(params, "_param_td", params)
 
 
 def link(
-    loss: Any, name: str, live: bool, *, critic: int | None = None, optional: bool = False
+    loss: Any, name: str, live: bool, *, critic: str | None = None, optional: bool = False
 ) -> Any:
     """An independent network with a loss's parameters, or with a copy of them."""
     if hasattr(loss, "member"):
@@ -263,7 +269,7 @@ def extract_critic(loss: LossModule, index: int = 0) -> TensorDictModule:
 
     Args:
         loss: such as :class:`~torchrl_bmrl.objectives.BCQLoss`.
-        index: of the critic; policies act with the first, 0.
+        index: of the critic.
 
     Example:
         >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network

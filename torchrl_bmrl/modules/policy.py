@@ -128,7 +128,8 @@ class BCQPolicy(LossPolicy):
         generator = link(loss, f"{student}generator", live)
         # Acting needs no encoder.
         part = getattr(generator.module, "decoder", generator.module)
-        critic = link(loss, f"{student}qvalue_network", live, critic=0)
+        rule = getattr(loss, "critic_rule", "clipped")
+        critic = link(loss, f"{student}qvalue_network", live, critic=rule)
         perturbation = None if student else link(loss, "perturbation_network", live, optional=True)
         bounds = None if student else (loss.action_low, loss.action_high)
         latent_dim = getattr(loss if student else generator.module, "latent_dim", None)

@@ -9,8 +9,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.functional import bcq_next_value
+from torchrl_bmrl.errors import BMRLError, UnknownNameError
+from torchrl_bmrl.functional import CRITIC_RULES, bcq_next_value, ensemble_value
 from torchrl_bmrl.objectives.checks import check_number, check_value_bounds
 from torchrl_bmrl.objectives.generative import GenerativeLoss
 
@@ -52,6 +52,9 @@ class BCQLoss(GenerativeLoss):
         num_qvalue_nets: number of critics; ``None`` for 2 from a single one, or the list's length.
         num_candidates: actions proposed per next state.
         lmbda: λ, weight of the critics' minimum against their maximum.
+        critic_rule: how several critics value an action. ``"clipped"``, as published: by λ in the
+            target, and by the first critic in the policy and the perturbation's loss. ``"mean"`` or
+            ``"min"``: by the mean or the minimum over the critics in all of them.
         latent_clip: bound on the latent of proposed actions; ``None`` for none.
         value_bounds: ``(low, high)`` that the next states' value is clamped to; ``None`` for none.
             With rewards in [0, 1], (0, 1 / (1 - γ)) keeps a critic from diverging.
@@ -96,6 +99,7 @@ class BCQLoss(GenerativeLoss):
         num_qvalue_nets: int | None = None,
         num_candidates: int = 10,
         lmbda: float = 0.75,
+        critic_rule: str = "clipped",
         latent_clip: float | None = 0.5,
         value_bounds: tuple[float, float] | None = None,
         **options: Any,
@@ -104,6 +108,9 @@ class BCQLoss(GenerativeLoss):
         self.num_candidates = check_number("num_candidates", num_candidates, 1, integer=True)
         self.value_bounds = check_value_bounds(value_bounds)
         self.register_coefficients(high=1.0, lmbda=lmbda)
+        if critic_rule not in CRITIC_RULES:
+            raise UnknownNameError("critic_rule", critic_rule, CRITIC_RULES)
+        self.critic_rule = critic_rule
         self.convert_critics(qvalue_network, num_qvalue_nets)
         self.finish()
 
@@ -125,14 +132,18 @@ class BCQLoss(GenerativeLoss):
         with torch.no_grad():
             after = self.rows(tensordict, self.observation_keys, after=True)
             proposals = self.perturb(self.propose(after, self.num_candidates), target=True)
-            next_value = bcq_next_value(self.qvalue(proposals, target=True), self.lmbda)
+            value = self.qvalue(proposals, target=True)
+            if self.critic_rule == "clipped":
+                next_value = bcq_next_value(value, self.lmbda)
+            else:
+                next_value = ensemble_value(value, self.critic_rule).amax(-1)
             if self.value_bounds is not None:
                 next_value = next_value.clamp(*self.value_bounds)
         data = self.rows(tensordict, self.qvalue_network.in_keys)
         return self.temporal_difference(tensordict, self.qvalue(data), next_value)
 
     def perturbation_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Loss of the perturbation network, -Q of the first critic; only it receives gradients.
+        """Loss of the perturbation network, -Q by ``critic_rule``; only it receives gradients.
 
         Returns:
             the loss, and no metrics.
@@ -146,5 +157,5 @@ class BCQLoss(GenerativeLoss):
             observation = self.rows(tensordict, self.observation_keys)
             proposal = self.propose(observation, 1).squeeze(-1)
         proposal = self.perturb(proposal)
-        value = self.qvalue(proposal, frozen=True)[0]
+        value = ensemble_value(self.qvalue(proposal, frozen=True), self.critic_rule)
         return self.reduce(-value, tensordict), {}
