@@ -36,6 +36,18 @@ class BCQLoss(GenerativeLoss):
        :math:`-Q_1(s, a + \phi\, h\, \xi(s, a))` with :math:`a = G(s, z)` and :math:`h` half the
        action's range
 
+    The generator decides which published method this is. All choose the best of N proposals, in the
+    target and in the policy:
+
+    - :class:`torchrl_bmrl.modules.ActionVAE` with a perturbation network: BCQ; without one, stage 1
+      of this project's paper.
+    - another model of the data's actions, without perturbation: EMaQ,
+      https://arxiv.org/abs/2007.11091, whose N is larger when acting. Such models are
+      :class:`torchrl_bmrl.modules.ActionMixture` and :class:`torchrl_bmrl.modules.ActionFlow`.
+    - :class:`torchrl_bmrl.modules.ActionFlow`, few candidates, ``critic_rule="mean"`` or ``"min"``:
+      best-of-N over a flow, as in Q-chunking, https://arxiv.org/abs/2507.07969, there with chunks
+      of actions.
+
     :meth:`forward` computes all of them with the present parameters. To follow the published order,
     call the three methods one after the other and step each optimizer in between. The generator has
     no target. :class:`~torchrl.objectives.SoftUpdate` or :class:`~torchrl.objectives.HardUpdate`
