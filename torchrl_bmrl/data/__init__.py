@@ -1,7 +1,8 @@
-"""Demonstrations: episodes, files, checks, n-step transitions, replay buffers."""
+"""Demonstrations: episodes, files, n-step transitions, chunks of actions, replay buffers."""
 
 from torchrl.data.datasets import register_dataset
 
+from torchrl_bmrl.data.chunks import ActionChunks
 from torchrl_bmrl.data.episodes import Episode, stack_episodes
 from torchrl_bmrl.data.n_step import NStep
 from torchrl_bmrl.data.replay import (
@@ -15,6 +16,7 @@ from torchrl_bmrl.data.replay import (
 register_dataset("robomimic", "torchrl_bmrl.data.datasets:RobomimicExperienceReplay", replace=True)
 
 __all__ = [
+    "ActionChunks",
     "Episode",
     "NStep",
     "make_mixed_replay_buffer",

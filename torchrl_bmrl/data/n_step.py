@@ -125,7 +125,7 @@ class NStep(nn.Module):
         after = data.get("next")
         if isinstance(after, LazyStackedTensorDict):  # it cannot be indexed along time
             after = after.contiguous()
-        data.set("next", after[_last_steps(steps)])
+        data.set("next", after[rows_later(steps - 1)])
         data.set(self.reward_key, reward.unsqueeze(-1))
         return data.set(STEPS_KEY, steps.unsqueeze(-1))
 
@@ -166,12 +166,16 @@ class NStep(nn.Module):
         return value
 
 
-def _last_steps(steps: Tensor) -> tuple[Tensor, ...]:
-    """Index of the last step of each row, one tensor for each batch dimension."""
+def rows_later(steps: Tensor) -> tuple[Tensor, ...]:
+    """Index of the rows so many steps later, one tensor for each batch dimension.
+
+    Args:
+        steps: for each row, ``(*B, T)``.
+    """
     # gather() would drop entries that are not tensors, such as strings.
     rows = [torch.arange(size, device=steps.device) for size in steps.shape]
     *batch, time = torch.meshgrid(*rows, indexing="ij")
-    return (*batch, time + steps - 1)
+    return (*batch, time + steps)
 
 
 def _check_tensor(key: NestedKey, value: object) -> Tensor:

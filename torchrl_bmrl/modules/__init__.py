@@ -1,5 +1,6 @@
 """Networks, policies, and the task embedding."""
 
+from torchrl_bmrl.modules.chunk_policy import ChunkPolicy
 from torchrl_bmrl.modules.demonstration_latent import DemonstrationTaskLatent
 from torchrl_bmrl.modules.discrete_policy import DiscreteBCQPolicy
 from torchrl_bmrl.modules.ensemble import EnsembleCritic
@@ -31,6 +32,7 @@ __all__ = [
     "ActionMixture",
     "ActionVAE",
     "BCQPolicy",
+    "ChunkPolicy",
     "DemonstrationTaskLatent",
     "DiscreteBCQPolicy",
     "EnsembleCritic",

@@ -1,0 +1,88 @@
+"""A policy that plays chunks of actions."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+
+from torchrl_bmrl.errors import BMRLError
+
+
+class ChunkPolicy(TensorDictModuleBase):
+    """Plays the actions of a chunk one after the other, then asks its policy for the next chunk.
+
+    The rest of the chunk travels with the data: TorchRL's rollouts and collectors pass what a
+    policy writes on to the next step. A chunk also ends where ``is_init`` is true, which
+    ``torchrl.envs.InitTracker`` writes: append it to environments that reset by themselves.
+
+    Args:
+        policy: writes chunks: ``size`` actions one after the other in the last dimension.
+        size: actions of a chunk.
+
+    Keyword Args:
+        action_key, chunk_key, step_key: names of the entries that it writes.
+        init_key: flag of an episode's first step, which the data may lack.
+
+    Keys read: those of the policy. Keys written: ``action (*B, action_dim)``, and for the next step
+    ``action_chunk (*B, size, action_dim)`` and ``action_chunk_step (*B, 1)``, the number of its
+    actions that were played.
+
+    Raises:
+        BMRLError: for a size below one; and at a call if it does not divide the policy's action.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_bmrl.modules import ActionFlow, BCQPolicy, make_qvalue_network
+        >>> policy = ChunkPolicy(BCQPolicy(ActionFlow(3, 4 * 2), make_qvalue_network(3, 4 * 2)), 4)
+        >>> policy(TensorDict({"observation": torch.zeros(5, 3)}, [5]))["action"].shape
+        torch.Size([5, 2])
+    """
+
+    def __init__(
+        self,
+        policy: TensorDictModuleBase,
+        size: int,
+        *,
+        action_key: NestedKey = "action",
+        chunk_key: NestedKey = "action_chunk",
+        step_key: NestedKey = "action_chunk_step",
+        init_key: NestedKey = "is_init",
+    ) -> None:
+        super().__init__()
+        if size < 1:
+            raise BMRLError(f"size is {size}; valid: at least 1")
+        self.policy, self.size = policy, size
+        self.action_key, self.chunk_key, self.step_key = action_key, chunk_key, step_key
+        self.init_key = init_key
+        self.in_keys = list(policy.in_keys)
+        self.out_keys = [action_key, chunk_key, step_key]
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the next action of the chunk."""
+        step, chunk = tensordict.get(self.step_key, None), tensordict.get(self.chunk_key, None)
+        if step is None or chunk is None:
+            chunk = self._next_chunk(tensordict)
+            step = torch.zeros(*chunk.shape[:-2], 1, dtype=torch.int64, device=chunk.device)
+        else:
+            ended = step >= self.size
+            if (first := tensordict.get(self.init_key, None)) is not None:
+                ended = ended | first.reshape(ended.shape)
+            if ended.any():
+                chunk = torch.where(ended.unsqueeze(-1), self._next_chunk(tensordict), chunk)
+                step = step.masked_fill(ended, 0)
+        index = step.unsqueeze(-1).expand(*step.shape[:-1], 1, chunk.shape[-1])
+        tensordict.set(self.action_key, chunk.gather(-2, index).squeeze(-2))
+        return tensordict.set(self.chunk_key, chunk).set(self.step_key, step + 1)
+
+    def _next_chunk(self, tensordict: TensorDictBase) -> torch.Tensor:
+        """The policy's chunk for the present state, ``(*B, size, action_dim)``."""
+        actions = self.policy(tensordict.select(*self.in_keys)).get(self.action_key)
+        if actions.shape[-1] % self.size:
+            raise BMRLError(
+                f"the policy writes {self.action_key!r} with {actions.shape[-1]} numbers; valid: a "
+                f"multiple of size, {self.size}"
+            )
+        return actions.unflatten(-1, (self.size, -1))
