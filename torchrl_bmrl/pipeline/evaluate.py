@@ -18,11 +18,11 @@ from torchrl_bmrl.envs.transforms import ObservationStatistics
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
-from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.pipeline.agents import Student
 from torchrl_bmrl.pipeline.held_out import evaluate_held_out
 from torchrl_bmrl.pipeline.run import Run
+from torchrl_bmrl.pipeline.stage1 import make_policy
 from torchrl_bmrl.reports import Embeddings, write_report
 from torchrl_bmrl.reports.films import explore_demonstrations
 from torchrl_bmrl.run.folder import read_versions
@@ -147,7 +147,7 @@ def evaluate_job(job: tuple[Run, tuple[str, str, str]], report: Report) -> list[
             report(len(seeds) * run.horizon(task))
             return outcomes
         if policy_name == "bcq":
-            policy = BCQPolicy.frozen(run.teacher(name), num_candidates=count)
+            policy = make_policy(run.teacher(name), run.settings)
             return run.play(task, policy, seeds=seeds, report=report)
         student, metadata = run.student()
         policy = student.policy(num_candidates=count, latent_clip=metadata["latent_clip"])

@@ -36,6 +36,8 @@ NOT_OF_THE_LOSS = (
     "batch_size",
     "lr",
     "n_steps",
+    "action_chunk",
+    "standard_reward",
     "tau",
     "generator_warmup",
     "critic_grad_clip",

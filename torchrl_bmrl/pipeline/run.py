@@ -131,6 +131,18 @@ class Run:
                 f"{', '.join(without)} of tasks have no environment; valid: tasks that have one"
             )
 
+    def check_single_actions(self, where: str) -> None:
+        """Checks that the agents of stage 1 propose single actions.
+
+        Args:
+            where: what needs them, for the message.
+
+        Raises:
+            ConfigError: if they propose chunks.
+        """
+        if (chunk := self.settings.bcq.action_chunk) > 1:
+            raise ConfigError(f"bcq.action_chunk is {chunk}; valid for {where}: 1")
+
     def task(self, name: str) -> Task:
         """Returns a task of the run.
 

@@ -69,6 +69,8 @@ class BCQSettings:
     kl_reduction: str = setting("mean", choices=KL_REDUCTIONS)  # reduction over the latent
     gamma: float = setting(0.99, at_least=0, at_most=1)  # discount factor
     n_steps: int = setting(1, above=0)  # rewards in the critics' target
+    action_chunk: int = setting(1, above=0)  # actions that are chosen at once, stage 1 only
+    standard_reward: bool = False  # rewards minus their mean, over their standard deviation
     tau: float = setting(0.005, above=0, at_most=1)  # update rate of the target networks
     perturbation: bool = False  # perturbation network; none in the paper
     max_perturbation: float = setting(0.05, at_least=0)  # bound on the perturbation
@@ -175,7 +177,12 @@ class Settings:
         """
         check_settings(self)
         check_value_bounds(self.bcq.value_bounds)
-        evaluate, distill = self.evaluate, self.distill
+        evaluate, distill, bcq = self.evaluate, self.distill, self.bcq
+        if bcq.n_steps > 1 and bcq.action_chunk > 1:
+            raise ConfigError(
+                f"bcq.n_steps is {bcq.n_steps} and bcq.action_chunk {bcq.action_chunk}; valid: one "
+                "of them 1, since a chunk's outcome is that of all its steps"
+            )
         if distill.task_encoder == "one_hot" and (
             evaluate.latent_sources != ["prototype"] or distill.isometry_weight
         ):

@@ -8,17 +8,20 @@ from statistics import fmean
 from typing import Any
 
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 
-from torchrl_bmrl.data import NStep, make_multi_task_replay_buffer, make_replay_buffer
+from torchrl_bmrl.data import make_multi_task_replay_buffer, make_replay_buffer
 from torchrl_bmrl.data.n_step import STEPS_KEY
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.files import write_rows
-from torchrl_bmrl.modules import BCQPolicy
+from torchrl_bmrl.modules import BCQPolicy, ChunkPolicy
 from torchrl_bmrl.objectives import BCQLoss
 from torchrl_bmrl.pipeline.learners import Agents, choose_updates
 from torchrl_bmrl.pipeline.run import Run
+from torchrl_bmrl.pipeline.settings import Settings
+from torchrl_bmrl.pipeline.training_data import training_data
 from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.training.fit import Every, fit
@@ -64,7 +67,11 @@ def stage1(run: Run) -> None:
 def train_job(job: tuple[Run, dict[str, str]], report: Report) -> None:
     """Trains agents (tasks by agent name) on their tasks' demonstrations."""
     run, agents = job
-    datasets = [training_data(run, task) for task in agents.values()]
+    datasets = [
+        part
+        for task in agents.values()
+        for part in training_data([run.transitions(task, "train")], run.settings.bcq)
+    ]
     options: dict[str, Any] = {
         "batch_size": run.settings.bcq.batch_size,
         "device": run.settings.device,
@@ -74,12 +81,6 @@ def train_job(job: tuple[Run, dict[str, str]], report: Report) -> None:
     else:
         buffer = make_multi_task_replay_buffer(datasets, **options)
     train_agents(run, agents, buffer, report, sizes=sizes_of(datasets[0]))
-
-
-def training_data(run: Run, task: str) -> TensorDictBase:
-    """Returns a task's training data ``[N]``; each row sums up ``bcq.n_steps`` steps."""
-    bcq, data = run.settings.bcq, run.transitions(task, "train")
-    return data if bcq.n_steps == 1 else NStep(bcq.n_steps, bcq.gamma)(data)
 
 
 def sizes_of(data: TensorDictBase) -> dict[str, int]:
@@ -156,10 +157,17 @@ def _evaluate_epoch(run: Run, trained: Agents, update: int) -> None:
         log.debug("bcq %s: mean return %.1f after epoch %d", name, mean, epoch)
 
 
+def make_policy(loss: BCQLoss, settings: Settings) -> TensorDictModuleBase:
+    """Returns the policy of an agent; it plays chunks if the agent proposes them."""
+    policy = BCQPolicy.frozen(loss, num_candidates=settings.evaluate.num_candidates)
+    chunk = settings.bcq.action_chunk
+    return policy if chunk == 1 else ChunkPolicy(policy, chunk)
+
+
 def _play(run: Run, task: str, loss: BCQLoss, epoch: int, update: int) -> list[dict]:
     """Plays episodes of an agent, from the same starts after every epoch."""
     seeds = [run.seed("curve", task, i) for i in range(run.settings.bcq.eval_episodes)]
-    policy = BCQPolicy.frozen(loss, num_candidates=run.settings.evaluate.num_candidates).to("cpu")
+    policy = make_policy(loss, run.settings).to("cpu")
     return [
         {
             "epoch": epoch,

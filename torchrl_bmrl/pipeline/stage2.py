@@ -13,13 +13,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_bmrl.data import make_multi_task_replay_buffer, with_previous
-from torchrl_bmrl.functional import nonzero_scale, sample_action_latent
+from torchrl_bmrl.functional import sample_action_latent
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.pipeline.agents import Student, make_distillation_loss
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.settings import DistillSettings
 from torchrl_bmrl.pipeline.stage1 import sizes_of
+from torchrl_bmrl.pipeline.training_data import deviation
 from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.training.checkpoint import resume_training, save_training
@@ -40,6 +41,7 @@ def stage2(run: Run) -> None:
         run: an open run, with the agents of every task.
 
     Raises:
+        ConfigError: for agents that propose chunks of actions.
         BMRLError: if an agent is missing, or the training diverges.
 
     Example:
@@ -49,6 +51,7 @@ def stage2(run: Run) -> None:
         ...
         torchrl_bmrl.errors.BMRLError: runs/mine is not open; valid: with Run(settings) as run: ...
     """
+    run.check_single_actions("the distillation")
     run.jobs(
         train_student,
         [None],
@@ -67,13 +70,7 @@ def value_statistics(
         teacher.qvalue_network(data.select("observation", "action")).get("state_action_value")
         for teacher, data in zip(teachers, datasets, strict=True)
     ]
-    return torch.stack([v.mean() for v in values]), torch.stack([spread(v) for v in values])
-
-
-def spread(values: Tensor) -> Tensor:
-    """Returns the standard deviation of a task's numbers ``(N, 1)``; 1 if they are equal."""
-    deviation = values.std() if len(values) > 1 else torch.zeros_like(values).sum()
-    return nonzero_scale(deviation, values.abs().max(), values.dtype)
+    return torch.stack([v.mean() for v in values]), torch.stack([deviation(v) for v in values])
 
 
 def loss_options(settings: DistillSettings) -> dict[str, Any]:
@@ -112,7 +109,7 @@ def train_student(job: tuple[Run, None], report: Report) -> None:
         teachers,
         qvalue_loc=normalisation[0],
         qvalue_scale=normalisation[1],
-        reward_scale=torch.stack([spread(data["next", "reward"]) for data in train]),
+        reward_scale=torch.stack([deviation(data["next", "reward"]) for data in train]),
         **loss_options(distill),
     ).to(settings.device)
     optimizer = make_adam(loss.parameters(), lr=distill.lr)

@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_bmrl.data import make_replay_buffer
+from torchrl_bmrl.data.n_step import STEPS_KEY
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation import rank_correlation
 from torchrl_bmrl.evaluation.fitted_q import estimate_return
@@ -24,6 +25,7 @@ from torchrl_bmrl.pipeline.agents import load_bcq_loss
 from torchrl_bmrl.pipeline.learners import Agents, choose_updates
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.stage1 import sizes_of
+from torchrl_bmrl.pipeline.training_data import training_data
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
 from torchrl_bmrl.reports.tables import Table
@@ -76,6 +78,7 @@ def fqe(run: Run, settings: FQESettings) -> str:
     if len(series) < 2 or series != sorted(series):
         raise ConfigError(f"fqe.checkpoints is {series}; valid: at least two, from low to high")
     run.check_open()
+    run.check_single_actions("fitted Q evaluation")
     run.check_playable()
     run.statistics  # noqa: B018 (missing demonstrations are found before anything is written)
     open_run(run.folder / settings.folder, asdict(settings))
@@ -117,7 +120,8 @@ def train_job(job: tuple[Run, tuple[str, list[int]]], report: Report) -> None:
         report(series[-1])
         return
     keep_freed_memory()
-    data, settings = run.transitions(name, "train"), run.settings
+    settings = run.settings
+    (data,) = training_data([run.transitions(name, "train")], settings.bcq)
     buffer = make_replay_buffer(data, batch_size=settings.bcq.batch_size, device=settings.device)
     agents = Agents(run, {name: name}, sizes_of(data))
     choose = choose_updates(run, agents.loss, agents.optimizers, agents.targets)
@@ -136,7 +140,7 @@ def train_job(job: tuple[Run, tuple[str, list[int]]], report: Report) -> None:
     for start, end in pairwise([0, *series]):
         fit(
             lambda update, batch: choose(update)(batch),
-            lambda: buffer.sample().select(*agents.loss.in_keys),
+            lambda: buffer.sample().select(*agents.loss.in_keys, STEPS_KEY, strict=False),
             start=start,
             total=end,
             every=Every(log=end, save=end),

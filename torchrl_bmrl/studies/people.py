@@ -23,6 +23,7 @@ from torchrl_bmrl.pipeline.collect import collect
 from torchrl_bmrl.pipeline.evaluate import evaluate_once
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.stage1 import sizes_of, train_agents
+from torchrl_bmrl.pipeline.training_data import training_data
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
 from torchrl_bmrl.reports.tables import MISSING, Table
@@ -67,6 +68,7 @@ def learn_from_people(run: Run, settings: HumanSettings) -> str:
         BMRLError: for demonstrations that cannot be trained on, or if a training diverges.
     """
     run.check_open()
+    run.check_single_actions("this study")
     if not settings.path:
         raise ConfigError("human.path is empty; valid: a file or folder with demonstrations")
     if settings.task not in run.names:
@@ -135,7 +137,7 @@ def train_job(job: Job, report: Report) -> None:
     raw = read_demonstrations(run.folder.parent / "demonstrations.hdf5", task, index=0)
     human = transform_data(raw, task, run.statistics).select(*scripted.keys(True, True))
     buffer = make_mixed_replay_buffer(
-        [scripted, human],
+        training_data([scripted, human], run.settings.bcq),
         weights=[1 - share, share],
         batch_size=run.settings.bcq.batch_size,
         device=run.settings.device,

@@ -1,0 +1,202 @@
+"""What the settings of stage 1's critics and generator do to a small run of files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gymnasium")
+pytest.importorskip("h5py")
+pytest.importorskip("safetensors")
+pytest.importorskip("tqdm")
+pytest.importorskip("yaml")
+
+import torch
+from episode_files import write_file
+from tensordict import TensorDict
+
+from torchrl_bmrl.errors import ConfigError
+from torchrl_bmrl.modules import ActionFlow, ActionMixture, BCQPolicy, ChunkPolicy
+from torchrl_bmrl.objectives import BCQLoss
+from torchrl_bmrl.pipeline import (
+    BCQSettings,
+    DistillSettings,
+    EvaluateSettings,
+    Run,
+    Settings,
+    collect,
+    stage1,
+    stage2,
+)
+from torchrl_bmrl.pipeline.stage1 import make_policy
+from torchrl_bmrl.pipeline.training_data import reward_statistics, training_data
+from torchrl_bmrl.pipeline.two_stage import two_stage
+
+TASKS = ("door", "drawer")
+PARTS = {"arm": ((3,), "float64")}
+
+
+def make(folder: Path, **bcq: Any) -> Run:
+    """A small run of two tasks whose demonstrations lie in its folder."""
+    small = {"batch_size": 4, "num_cells": [8]}
+    files = {name: {"demonstrations": str(folder / f"{name}.hdf5")} for name in TASKS}
+    return Run(
+        Settings(
+            run_dir=str(folder),
+            workers=1,
+            tasks=files,
+            bcq=BCQSettings(**({"epochs": 1, "updates_per_epoch": 3, **small} | bcq)),
+            distill=DistillSettings(updates=3, **small),
+            evaluate=EvaluateSettings(episodes=1, num_candidates=3),
+        )
+    )
+
+
+def written(folder: Path, **bcq: Any) -> Run:
+    for index, name in enumerate(TASKS):
+        write_file(folder / f"{name}.hdf5", [n + index for n in (5, 6, 7, 8)], parts=PARTS)
+    return make(folder, **bcq)
+
+
+def trained(folder: Path, **bcq: Any) -> Run:
+    run = written(folder, **bcq)
+    with run:
+        collect(run)
+        stage1(run)
+    return run
+
+
+# -- generators and critics ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "latent"), [("flow", 0), ("mixture", 1)])
+def test_both_stages_run_with_another_generator(tmp_path: Path, name: str, latent: int) -> None:
+    run = trained(tmp_path, generator=name)
+    with run:
+        stage2(run)
+    loss, (student, metadata) = run.teacher("door"), run.student()
+    kinds = {"flow": ActionFlow, "mixture": ActionMixture}
+    assert isinstance(loss.generator, kinds[name])
+    action_dim = run.transitions("door", "train")["action"].shape[-1]
+    assert student.latent_dim == action_dim + latent
+    assert metadata["latent_clip"] is None
+
+
+def test_a_stack_trains_agents_with_any_generator(tmp_path: Path) -> None:
+    run = trained(tmp_path, generator="flow", stacked=True, critic_rule="mean", layer_norm=True)
+    assert isinstance(run.teacher("drawer").generator, ActionFlow)
+
+
+def test_an_option_that_the_generator_does_not_take_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(Exception, match=r"kl_weight is 0.1, and generator ActionFlow"):
+        trained(tmp_path, generator="flow", kl_weight=0.1)
+
+
+def test_agents_have_the_critics_of_the_settings_also_when_loaded(tmp_path: Path) -> None:
+    options = {"num_qvalue_nets": 3, "layer_norm": True, "critic_rule": "min"}
+    loss = trained(tmp_path, **options).teacher("door")
+    assert loss.num_qvalue_nets == 3
+    assert loss.critic_rule == "min"
+    assert any(isinstance(part, torch.nn.LayerNorm) for part in loss.qvalue_network.modules())
+
+
+# -- the critics' data -----------------------------------------------------------------------------
+
+
+def data(rewards: list[float], *, terminated: bool = False) -> TensorDict:
+    number = len(rewards)
+    last = (torch.arange(number) == number - 1).unsqueeze(-1)
+    after = {"reward": torch.tensor(rewards).unsqueeze(-1), "done": last}
+    after |= {"terminated": last & terminated, "observation": torch.arange(number).unsqueeze(-1)}
+    return TensorDict({"action": torch.zeros(number, 2), "next": after}, [number])
+
+
+def test_standard_rewards_have_mean_zero_and_deviation_one() -> None:
+    before = data([1.0, 2.0, 6.0])
+    (part,) = training_data([before], BCQSettings(standard_reward=True))
+    assert part["next", "reward"].mean().item() == pytest.approx(0.0, abs=1e-6)
+    assert part["next", "reward"].std().item() == pytest.approx(1.0)
+    assert before["next", "reward"].flatten().tolist() == [1.0, 2.0, 6.0]
+
+
+def test_rewards_of_episodes_that_terminate_are_scaled_but_not_shifted() -> None:
+    """A shift would pay for an early or a late end."""
+    (part,) = training_data(
+        [data([0.0, 0.0, 6.0], terminated=True)], BCQSettings(standard_reward=True)
+    )
+    reward = part["next", "reward"].flatten()
+    assert reward[0] == reward[1] == 0
+    assert reward.std().item() == pytest.approx(1.0)
+
+
+def test_equal_rewards_are_shifted_to_zero_and_not_divided_by_zero() -> None:
+    (part,) = training_data([data([2.0, 2.0])], BCQSettings(standard_reward=True))
+    assert part["next", "reward"].flatten().tolist() == [0.0, 0.0]
+    assert reward_statistics(data([2.0, 2.0]))[1] == 1
+
+
+def test_the_first_part_of_the_data_decides_the_scale_of_all() -> None:
+    first, second = training_data(
+        [data([1.0, 2.0, 6.0]), data([3.0, 3.0])], BCQSettings(standard_reward=True)
+    )
+    assert second["next", "reward"].flatten().tolist() == pytest.approx([0.0, 0.0], abs=1e-6)
+    assert first["next", "reward"].flatten()[-1] > 1
+
+
+def test_the_outcome_of_a_row_is_that_of_its_steps_or_of_its_chunk() -> None:
+    (steps,) = training_data([data([1.0] * 4)], BCQSettings(n_steps=3, gamma=0.5))
+    assert steps["next", "reward"].flatten().tolist() == [1.75, 1.75, 1.5, 1.0]
+    (chunks,) = training_data([data([1.0] * 4)], BCQSettings(action_chunk=3, gamma=0.5))
+    assert chunks["action"].shape == (2, 6)
+    assert chunks["next", "reward"].flatten().tolist() == [1.75, 1.75]
+
+
+def test_with_the_defaults_the_data_are_those_that_were_given() -> None:
+    before = data([1.0, 2.0])
+    assert training_data([before], BCQSettings())[0] is before
+
+
+@pytest.mark.parametrize("option", ["n_steps", "action_chunk"])
+def test_the_critics_discount_by_the_steps_of_each_row(
+    tmp_path: Path, option: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[TensorDict] = []
+    run_loss = BCQLoss.qvalue_loss
+
+    def spy(self: BCQLoss, batch: TensorDict) -> Any:
+        seen.append(batch)
+        return run_loss(self, batch)
+
+    monkeypatch.setattr(BCQLoss, "qvalue_loss", spy)
+    trained(tmp_path, **{option: 3})
+    steps = torch.cat([batch["steps_to_next_obs"].flatten() for batch in seen])
+    assert steps.max() == 3
+
+
+# -- chunks ----------------------------------------------------------------------------------------
+
+
+def test_agents_of_chunks_play_them_action_by_action(tmp_path: Path) -> None:
+    run = trained(tmp_path, action_chunk=3)
+    policy = make_policy(run.teacher("door"), run.settings)
+    assert isinstance(policy, ChunkPolicy)
+    transitions = run.transitions("door", "train")
+    action = policy(transitions[:1].select("observation"))["action"]
+    assert action.shape == transitions[:1]["action"].shape
+    assert isinstance(make_policy(run.teacher("door"), Settings()), BCQPolicy)
+
+
+@pytest.mark.parametrize("stage", [stage2, two_stage], ids=["stage2", "two_stage"])
+def test_the_distillation_refuses_chunks_before_it_begins(tmp_path: Path, stage: Any) -> None:
+    run = written(tmp_path, action_chunk=3)
+    with run, pytest.raises(ConfigError, match=r"bcq.action_chunk is 3; valid for the distill"):
+        stage(run)
+    assert not (tmp_path / "data").exists()
+
+
+def test_steps_and_chunks_together_are_refused() -> None:
+    settings = Settings(bcq=BCQSettings(n_steps=2, action_chunk=3))
+    with pytest.raises(ConfigError, match=r"bcq.n_steps is 2 and bcq.action_chunk 3; valid: one"):
+        settings.check()
