@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ from torchrl_bmrl.pipeline import (
 from torchrl_bmrl.pipeline.stage1 import make_policy
 from torchrl_bmrl.pipeline.training_data import reward_statistics, training_data
 from torchrl_bmrl.pipeline.two_stage import two_stage
+from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 TASKS = ("door", "drawer")
 PARTS = {"arm": ((3,), "float64")}
@@ -100,6 +102,18 @@ def test_agents_have_the_critics_of_the_settings_also_when_loaded(tmp_path: Path
     assert loss.num_qvalue_nets == 3
     assert loss.critic_rule == "min"
     assert any(isinstance(part, torch.nn.LayerNorm) for part in loss.qvalue_network.modules())
+
+
+@pytest.mark.parametrize("cosine", [True, False])
+def test_the_learning_rate_of_stage_1_decays_as_a_cosine_or_stays(
+    tmp_path: Path, cosine: bool
+) -> None:
+    run = trained(tmp_path, cosine=cosine, lr=0.01, updates_per_epoch=4)
+    state, _ = load_checkpoint(run.agent_path("door"), kind="bcq")
+    share = 3 / 4 if cosine else 0.0
+    for optimizer in state["optimizers"].values():
+        (group,) = optimizer["param_groups"]
+        assert float(group["lr"]) == pytest.approx(0.01 * (1 + math.cos(math.pi * share)) / 2)
 
 
 # -- the critics' data -----------------------------------------------------------------------------

@@ -35,6 +35,7 @@ NOT_OF_THE_LOSS = (
     "eval_episodes",
     "batch_size",
     "lr",
+    "cosine",
     "n_steps",
     "action_chunk",
     "standard_reward",

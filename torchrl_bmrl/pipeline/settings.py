@@ -57,6 +57,7 @@ class BCQSettings:
     eval_episodes: int = setting(3, above=0)  # episodes after each epoch, for the curves
     batch_size: int = setting(128, above=0)  # transitions per update
     lr: float = setting(1e-3, above=0)  # learning rate of Adam
+    cosine: bool = False  # the learning rate decays to zero
     num_cells: list[int] = setting([256, 256], above=0)  # widths of the hidden layers
     generator: str = setting("autoencoder", choices=tuple(GENERATORS))  # model of the actions
     num_qvalue_nets: int = setting(2, above=0)  # critics of each agent

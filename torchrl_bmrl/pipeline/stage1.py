@@ -25,7 +25,7 @@ from torchrl_bmrl.pipeline.training_data import training_data
 from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.training.fit import Every, fit
-from torchrl_bmrl.training.update import keep_freed_memory
+from torchrl_bmrl.training.update import decay, keep_freed_memory
 
 log = logging.getLogger(__name__)
 
@@ -126,8 +126,14 @@ def train_agents(
                 for name, row in trained.check(metrics, batch, update).items():
                     log_metrics(loggers[name] if logging else None, row, update)
 
+            def step(update: int, batch: TensorDictBase) -> dict[str, Tensor]:
+                if bcq.cosine:
+                    for optimizer in trained.optimizers.values():
+                        decay(optimizer, bcq.lr, update, total)
+                return choose(update)(batch)
+
             fit(
-                lambda update, batch: choose(update)(batch),
+                step,
                 lambda: buffer.sample().select(*trained.loss.in_keys, STEPS_KEY, strict=False),
                 start=trained.updates,
                 total=total,

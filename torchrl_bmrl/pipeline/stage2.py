@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from contextlib import ExitStack
 from copy import deepcopy
 from typing import Any
@@ -26,7 +25,13 @@ from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.training.checkpoint import resume_training, save_training
 from torchrl_bmrl.training.fit import Every, fit
 from torchrl_bmrl.training.health import check_metrics, check_proposals
-from torchrl_bmrl.training.update import accelerate, gradient_step, keep_freed_memory, make_adam
+from torchrl_bmrl.training.update import (
+    accelerate,
+    decay,
+    gradient_step,
+    keep_freed_memory,
+    make_adam,
+)
 
 log = logging.getLogger(__name__)
 
@@ -138,10 +143,8 @@ def train_student(job: tuple[Run, None], report: Report) -> None:
     )
 
     def step(number: int, batch: TensorDictBase) -> dict[str, Tensor]:
-        if distill.cosine:  # from lr to zero
-            share = (number - 1) / distill.updates
-            rate = distill.lr * (1 + math.cos(math.pi * share)) / 2
-            optimizer.param_groups[0]["lr"].fill_(rate)
+        if distill.cosine:
+            decay(optimizer, distill.lr, number, distill.updates)
         return accelerated(batch.select(*loss.in_keys))
 
     def check(

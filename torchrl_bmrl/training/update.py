@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import math
 import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -62,6 +63,25 @@ def make_adam(params: Iterable[Tensor], lr: float) -> Adam:
             "exp_avg_sq": torch.zeros_like(param),
         }
     return optimizer
+
+
+def decay(optimizer: Adam, lr: float, update: int, total: int) -> None:
+    """Sets the learning rate of an update, which decays to zero as a cosine.
+
+    Args:
+        optimizer: of :func:`make_adam`.
+        lr: learning rate of the first update.
+        update: number of the update; the first is 1.
+        total: number of the last update.
+
+    Example:
+        >>> optimizer = make_adam(torch.nn.Linear(2, 1).parameters(), lr=1.0)
+        >>> decay(optimizer, 1.0, update=51, total=100)
+        >>> round(optimizer.param_groups[0]["lr"].item(), 6)
+        0.5
+    """
+    share = (update - 1) / total
+    optimizer.param_groups[0]["lr"].fill_(lr * (1 + math.cos(math.pi * share)) / 2)
 
 
 def keep_freed_memory() -> bool:
