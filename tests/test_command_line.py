@@ -30,7 +30,7 @@ from torchrl_bmrl.pipeline import Run, Settings
         (["preset=smoke", "bcq.lrr=1"], ["bcq.lrr", "BCQSettings"]),
         (["preset=smoke", "bcq.lr=abc"], ["bcq.lr", "'abc'", "Float"]),
         (["preset=smoke", "tasks=[lfit]"], ["error: unknown task 'lfit'", "reach, lift, push_r"]),
-        (["preset=fast"], ["preset/fast", "compose", "literal", "paper", "quick", "smoke"]),
+        (["preset=fast"], ["preset/fast", "compose", "mixed", "paper", "quick", "weak"]),
         (["preset=smoke", "logger=log"], ["unknown logger 'log'", "csv, wandb, tensorboard, none"]),
         (["preset=smoke", "distill.updates=-5"], ["error: distill.updates is -5", "above 0"]),
     ],
@@ -170,7 +170,10 @@ def test_rows_that_are_read_back_are_reported_as_the_steps_that_they_took(
     assert reported == [7 * 3]
 
 
-@pytest.mark.parametrize("preset", ["smoke", "quick", "paper", "literal", "compose"])
+PRESETS = sorted(path.stem for path in (RECIPES / "config" / "preset").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_is_complete_and_valid(recipes: Any, tmp_path: Path, preset: str) -> None:
     settings = settings_of(f"preset={preset}", f"run_dir={tmp_path}")
     settings.check()

@@ -27,7 +27,8 @@ from torchrl_bmrl.run.folder import open_run, read_settings
 from torchrl_bmrl.run.locks import lock, lock_run
 
 MADE = ("preset=paper", "ablation=dim4", "seed=3", "bcq.lr=1e-4")
-MADE += ("+collect.after.lift=['',reach]", "workers=7", "verbose=true", "device=cuda")
+MADE += ("+collect.after.lift=['',reach]", "+collect.experts.lift=[{},{noise:0.5}]")
+MADE += ("workers=7", "verbose=true", "device=cuda")
 
 
 @pytest.fixture
@@ -56,6 +57,7 @@ def test_a_command_on_a_run_takes_what_it_does_not_give_from_the_folder(
     assert (config.preset, config.ablation, config.seed) == ("paper", "dim4", 3)
     assert config.collect.train_episodes["lift"] == 500
     assert config.collect.after == {"lift": ["", "reach"]}
+    assert config.collect.experts == {"lift": [{}, {"noise": 0.5}]}
     assert config.bcq.lr == 1e-4
     assert config.evaluate.episodes == 50
     if name == "imitate":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from torchrl_bmrl.data.robomimic import (
     write_episodes,
 )
 from torchrl_bmrl.errors import ConfigError, DataError
+from torchrl_bmrl.experts.settings import Experts, ExpertSettings, experts_of
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
 from torchrl_bmrl.tasks import Task, get_task
 
@@ -26,16 +28,19 @@ class _EpisodeJob:
 
     task: Task
     seed: int
-    noise: float
     path: Path
-    gains: Any
+    expert: ExpertSettings
     after: tuple[Task, ...]
 
 
 def _collect_job(job: _EpisodeJob, report: Report) -> None:
     assert job.task.record is not None
     episode = job.task.record(
-        job.seed, noise=job.noise, gains=job.gains, after=job.after, **job.task.options
+        job.seed,
+        noise=job.expert.noise,
+        gains=job.expert.gains,
+        after=job.after,
+        **job.task.options,
     )
     keep_episode(job.path, episode)
     report(1)
@@ -52,6 +57,7 @@ def collect_demonstrations(
     workers: int,
     gains: Any = None,
     after: Mapping[str, Sequence[str]] | None = None,
+    experts: Experts | None = None,
 ) -> dict[str, Path]:
     """Records demonstrations, one file in robomimic's layout per task.
 
@@ -69,12 +75,18 @@ def collect_demonstrations(
         gains: gains of the experts; ``None`` for the defaults.
         after: by task, a list of starts: names of tasks whose experts act first, joined by ``-``,
             or ``""``; the task's episodes use the entries in turn.
+        experts: by task, or ``"default"``, a list of changes to ``noise`` and ``gains``
+            (:func:`~torchrl_bmrl.experts.settings.experts_of`); the task's episodes use the entries
+            in turn. The file contains the list in the attribute ``experts`` of ``data``. If it has
+            several entries, each demonstration has the index of its entry in the attribute
+            ``expert``, and the masks ``expert_<i>``, ``expert_<i>_train`` and ``expert_<i>_valid``
+            select the demonstrations of one entry.
 
     Returns:
         the file of each task.
 
     Raises:
-        ConfigError: for a task without ``record``.
+        ConfigError: for a task without ``record``, and for invalid ``experts``.
         UnknownNameError: for a name in ``after`` that is not a task.
         DataError: if an existing file has another number of episodes.
         StoppedError: if the run is stopped; finished episodes are saved.
@@ -101,6 +113,8 @@ def collect_demonstrations(
         name: [_parse_after(entry, by_name) for entry in (after or {}).get(name, ())] or [()]
         for name in by_name
     }
+    changes = experts or {}
+    chosen = {name: experts_of(name, changes, noise=noise, gains=gains) for name in by_name}
     files = {name: directory / f"{name}.hdf5" for name in by_name}
     counts = {name: episodes[name] + valid_episodes for name in by_name}
     parts = {
@@ -112,9 +126,8 @@ def collect_demonstrations(
         _EpisodeJob(
             task=by_name[name],
             seed=derive_seed(seed, "collect", name, i),
-            noise=noise,
             path=path,
-            gains=gains,
+            expert=chosen[name][i % len(chosen[name])],
             after=befores[name][i % len(befores[name])],
         )
         for name, paths in parts.items()
@@ -133,16 +146,25 @@ def collect_demonstrations(
         unit="episode",
     )
     for name, paths in parts.items():
-        first = read_kept_episode(paths[0])
+        first, count = read_kept_episode(paths[0]), len(chosen[name])
+        masks = {
+            "train": range(episodes[name]),
+            "valid": range(episodes[name], counts[name]),
+        }
         write_episodes(
             files[name],
-            (_without_env_args(read_kept_episode(path)) for path in paths),
-            masks={
-                "train": range(episodes[name]),
-                "valid": range(episodes[name], counts[name]),
-            },
+            (
+                _prepare(read_kept_episode(path), None if count == 1 else i % count)
+                for i, path in enumerate(paths)
+            ),
+            masks={**masks, **({} if count == 1 else _expert_masks(masks, count))},
             env_args=first.attributes.get("env_args", {}),
-            attributes={"task": name, "action_noise": noise, "seed": seed},
+            attributes={
+                "task": name,
+                "action_noise": chosen[name][0].noise if count == 1 else noise,
+                "seed": seed,
+                **_entries(changes.get(name, changes.get("default"))),
+            },
         )
         # The whole folder: a killed process may have left temporary files in it.
         shutil.rmtree(directory / ".episodes" / name)
@@ -162,7 +184,24 @@ def _parse_after(entry: str, by_name: Mapping[str, Task]) -> tuple[Task, ...]:
     return tuple(by_name[name] if name in by_name else get_task(name) for name in names)
 
 
-def _without_env_args(episode: Episode) -> Episode:
-    """Drops the attribute that is stored once for the whole file."""
+def _prepare(episode: Episode, expert: int | None) -> Episode:
+    """Drops the attribute that is stored once for the whole file, and adds the expert's index."""
     attributes = {key: value for key, value in episode.attributes.items() if key != "env_args"}
-    return replace(episode, attributes=attributes)
+    return replace(episode, attributes=attributes | ({} if expert is None else {"expert": expert}))
+
+
+def _entries(entries: Sequence[Mapping[str, float]] | None) -> dict[str, str]:
+    """Returns the file's attribute for a task's experts; empty if the setting has no entries."""
+    return {} if entries is None else {"experts": json.dumps([dict(entry) for entry in entries])}
+
+
+def _expert_masks(masks: Mapping[str, range], count: int) -> dict[str, list[int]]:
+    """Returns the masks of each of ``count`` experts, without empty ones."""
+    every = {"": range(sum(map(len, masks.values())))}
+    every |= {f"_{mask}": positions for mask, positions in masks.items()}
+    found = {
+        f"expert_{expert}{mask}": [i for i in positions if i % count == expert]
+        for expert in range(count)
+        for mask, positions in every.items()
+    }
+    return {name: positions for name, positions in found.items() if positions}

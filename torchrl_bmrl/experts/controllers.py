@@ -15,6 +15,7 @@ import numpy as np
 
 from torchrl_bmrl.envs.skills import Lift, Push, Reach, Skill
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.run.settings import setting
 
 if TYPE_CHECKING:
     from torchrl_bmrl.envs.scene import TabletopScene
@@ -52,14 +53,14 @@ class ExpertGains:
         (0.5, 4.0)
     """
 
-    position: float = 4.0
-    grasp_position: float = 1.5
-    rotation: float = 1.0
-    speed_limit: float = 1.0
-    contact_speed_limit: float = 0.7
-    grasp_steps: int = 10
-    lift_height: float = 0.10
-    push_line: float = 0.20
+    position: float = setting(4.0, at_least=0)
+    grasp_position: float = setting(1.5, at_least=0)
+    rotation: float = setting(1.0, at_least=0)
+    speed_limit: float = setting(1.0, above=0, at_most=1)
+    contact_speed_limit: float = setting(0.7, above=0, at_most=1)
+    grasp_steps: int = setting(10, at_least=0)
+    lift_height: float = setting(0.10, at_least=0)
+    push_line: float = setting(0.20, at_least=0)
 
 
 class Expert:

@@ -54,6 +54,7 @@ def collect(run: Run) -> None:
             seed=run.settings.seed,
             workers=run.settings.workers,
             after=settings.after,
+            experts=settings.experts,
         )
     _import_files(run)
     statistics = write_statistics(run.data_dir, run.tasks)

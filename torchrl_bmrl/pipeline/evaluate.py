@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from itertools import cycle
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -179,8 +180,11 @@ def expert_outcomes(run: Run, name: str, seeds: list[int]) -> list[EpisodeOutcom
     """Returns the expert's outcomes: new episodes from the seeds, or its demonstrations."""
     task, collect = run.task(name), run.settings.collect
     if run.settings.evaluate.expert_rollouts and task.record is not None:
-        options = {"noise": collect.noise, "gains": collect.gains, **task.options}
-        episodes = (task.record(seed, **options) for seed in seeds)
+        experts = collect.experts_of(name)
+        episodes = (
+            task.record(seed, noise=expert.noise, gains=expert.gains, **task.options)
+            for seed, expert in zip(seeds, cycle(experts), strict=False)
+        )
         return [
             EpisodeOutcome(float(episode.rewards.sum()), bool(episode.extras["successes"].any()))
             for episode in episodes

@@ -75,7 +75,7 @@ class Run:
         if settings.robot and not any("robot" in task.options for task in made):
             raise ConfigError(f"robot is {settings.robot}; valid for tasks without robosuite: null")
         self.tasks = tuple(_with_run_options(task, settings) for task in made)
-        _check_names(settings, self.names)
+        _check_names(settings, self.tasks)
         self.folder = Path(settings.run_dir)
         episodes = _train_episodes(settings, self.tasks)
         collect = replace(settings.collect, train_episodes=episodes)
@@ -356,13 +356,20 @@ def _with_run_options(task: Task, settings: Settings) -> Task:
     return task.with_options(**known)
 
 
-def _check_names(settings: Settings, names: Sequence[str]) -> None:
+def _check_names(settings: Settings, tasks: Sequence[Task]) -> None:
     """Raises an error for settings of unknown tasks; other registered tasks are allowed."""
     episodes, after = settings.collect.train_episodes, settings.collect.after
+    experts, names = settings.collect.experts, [task.name for task in tasks]
     parts = [part for entries in after.values() for entry in entries for part in entry.split("-")]
-    for name in [*episodes, *after, *filter(None, parts)]:
+    for name in [*episodes, *after, *experts, *filter(None, parts)]:
         if name not in ("default", *names):
             get_task(name)
+    for task in tasks:
+        if task.record is None and task.name in experts:
+            raise ConfigError(
+                f"collect.experts has {task.name}, whose demonstrations are files; valid: tasks "
+                "with a scripted expert, or default"
+            )
 
 
 def _train_episodes(settings: Settings, tasks: Sequence[Task]) -> dict[str, int]:

@@ -8,6 +8,7 @@ from typing import Any
 from torchrl_bmrl.data.replay import check_device
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.experts.controllers import ExpertGains
+from torchrl_bmrl.experts.settings import ExpertSettings, experts_of
 from torchrl_bmrl.functional import CRITIC_RULES
 from torchrl_bmrl.objectives.checks import check_value_bounds
 from torchrl_bmrl.objectives.common import LOSS_FUNCTIONS
@@ -41,6 +42,17 @@ class CollectSettings:
     # By task: tasks whose experts act before an episode, in turn, for starts as in a composition.
     after: dict[str, list[str]] = field(default_factory=dict)
     gains: ExpertGains = field(default_factory=ExpertGains)  # gains of the experts
+    # By task, or "default": experts of different quality, each given by its changes to noise and
+    # gains. The episodes use them in turn. (Not float: OmegaConf refuses whole numbers there.)
+    experts: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+
+    def experts_of(self, task: str) -> list[ExpertSettings]:
+        """Returns the experts that demonstrate a task; episode ``i`` uses ``i`` modulo the length.
+
+        Raises:
+            ConfigError: for invalid ``experts``.
+        """
+        return experts_of(task, self.experts, noise=self.noise, gains=self.gains)
 
 
 @dataclass
@@ -177,6 +189,8 @@ class Settings:
             BMRLError: naming the setting, its value and the valid values.
         """
         check_settings(self)
+        for name in self.collect.experts:
+            self.collect.experts_of(name)
         check_value_bounds(self.bcq.value_bounds)
         evaluate, distill, bcq = self.evaluate, self.distill, self.bcq
         if bcq.n_steps > 1 and bcq.action_chunk > 1:

@@ -131,11 +131,11 @@ def demonstrate(run: Run, task: Task, number: int) -> TensorDictBase:
 
     def record(path: Path) -> None:
         assert task.record is not None
-        collect = run.settings.collect
-        options = {"noise": collect.noise, "gains": collect.gains, **task.options}
+        experts = run.settings.collect.experts_of(task.name)
+        expert = experts[number % len(experts)]
         for attempt in range(MAX_ATTEMPTS):
             seed = run.seed("imitate", "demonstration", number, attempt)
-            episode = task.record(seed, **options)
+            episode = task.record(seed, noise=expert.noise, gains=expert.gains, **task.options)
             if episode.extras["successes"].any():
                 return keep_episode(path, episode)
         raise BMRLError(f"the expert of {task.name} failed from {MAX_ATTEMPTS} starts")
