@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -70,6 +71,11 @@ class Diagnostics:
         return None if self.latent_kl is None else sum(kl > ACTIVE for kl in self.latent_kl)
 
     @property
+    def relative_gap(self) -> float:
+        """``qvalue_gap`` in standard deviations of the data's values."""
+        return self.qvalue_gap / self.qvalue_std if self.qvalue_std else math.nan
+
+    @property
     def collapsed(self) -> bool:
         """Whether the candidates vary much less than the data."""
         return self.spread_ratio < COLLAPSED
@@ -83,7 +89,7 @@ class Diagnostics:
         """Numbers by name, for a logger; an autoencoder also has its latent's."""
         named = {name: x for name, x in vars(self).items() if name != "latent_kl"}
         if self.latent_kl is not None:
-            named["active_latents"] = float(sum(kl > ACTIVE for kl in self.latent_kl))
+            named["active_latents"] = sum(kl > ACTIVE for kl in self.latent_kl)
             named["largest_latent_kl"] = max(self.latent_kl)
         return named
 
