@@ -138,7 +138,7 @@ def diagnosed(ratio: float, share: float = 0.01, kl: Any = None) -> Diagnostics:
 def test_the_page_shows_the_last_diagnostics_of_every_agent(tmp_path: Path) -> None:
     agents = {
         "pour": (diagnosed(0.9), diagnosed(0.051, kl=(0.02, 0.001, 0.5))),
-        "lift": (diagnosed(1.0), diagnosed(1.7, share=0.3)),
+        "lift": (diagnosed(1.0), diagnosed(1.7, share=0.7)),
         "lift-1": (diagnosed(0.1), diagnosed(0.96)),
         "lift-3": (diagnosed(0.1), diagnosed(0.1)),  # of no agent of the run
     }
@@ -153,7 +153,7 @@ def test_the_page_shows_the_last_diagnostics_of_every_agent(tmp_path: Path) -> N
     assert table.splitlines() == [
         "Agent,Update,Spread,Spread ratio,Value gap,Outside,Active latents,Finding",
         "Pouring water,1000,0.012,0.05,+0.25,1%,2 of 3,clones the demonstrations",
-        "Lifting,1000,0.012,1.70,+0.25,30%,–,leaves the demonstrations",
+        "Lifting,1000,0.012,1.70,+0.25,70%,–,leaves the demonstrations",
         '"Lifting, 1",1000,0.012,0.96,+0.25,1%,–,–',
     ]
 

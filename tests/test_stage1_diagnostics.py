@@ -181,7 +181,7 @@ def test_a_run_that_was_stopped_has_the_diagnostics_of_one_that_was_not(
     ("ratio", "share", "level", "text"),
     [
         (0.1, 0.0, logging.INFO, "stage 1: the candidates of door, drawer vary less than"),
-        (1.0, 0.5, logging.WARNING, "stage 1: door, drawer choose actions that"),
+        (1.0, 0.6, logging.WARNING, "stage 1: door, drawer: most chosen actions are unlike"),
     ],
 )
 def test_a_finding_is_logged_once_for_all_agents(

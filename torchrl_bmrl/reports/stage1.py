@@ -98,8 +98,8 @@ def diagnostics_table(diagnosed: Mapping[str, tuple[int, Diagnostics]]) -> Table
             f"demonstrations, below {COLLAPSED} the policy clones them, far above 1 it proposes "
             "actions that they do not contain. Value gap: how much more the critic promises for "
             "the chosen action than for the demonstrated one, in standard deviations of its "
-            "values. Outside: share of the chosen action components that are farther from the "
-            f"candidates' mean than {USUAL:.0%} of the demonstrated ones; above {OUTSIDE:.0%} the "
+            "values. Outside: share of the chosen actions that are farther from the candidates' "
+            f"mean than {USUAL:.0%} of the demonstrated ones; above {OUTSIDE:.0%} the "
             "policy leaves the demonstrations. Active latents: dimensions of the autoencoder's "
             f"latent with a KL divergence above {ACTIVE} nats."
         ),

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from torchrl_bmrl.files import number, read_rows, whole, write_rows
 from torchrl_bmrl.functional import gaussian_kl
@@ -21,9 +22,11 @@ ACTIVE = 0.01
 COLLAPSED = 0.2
 """Candidates with a smaller ``spread_ratio`` have collapsed: the policy clones the data."""
 USUAL = 0.99
-"""Share of the data's actions that lie within the data's range around a state's mean candidate."""
-OUTSIDE = 0.1
-"""With a larger ``outside_share`` chosen actions leave the data: ten times the data's own share."""
+"""Share of the data's actions that are inside the data, by their distance to the mean candidate."""
+FEWEST = 10
+"""Candidates that are drawn for the spread even if the policy chooses among fewer."""
+OUTSIDE = 0.5
+"""With a larger ``outside_share`` most chosen actions leave the data."""
 _COLUMNS = {
     "epoch": whole,
     "update": whole,
@@ -45,8 +48,8 @@ class Diagnostics:
             generator that models the data exactly has 1, one that ignores its noise 0.
         qvalue_gap: mean of Q1(s, chosen action) - Q1(s, action of the data).
         qvalue_std: standard deviation of Q1 over the data.
-        outside_share: share of the chosen actions' components that are farther from the state's
-            mean candidate than :data:`USUAL` of the data's are, in the same dimension.
+        outside_share: share of the chosen actions that are farther from their state's mean
+            candidate than :data:`USUAL` of the data's are.
         latent_kl: mean KL divergence of each latent dimension [nats]; ``None`` without an encoder.
 
     Example:
@@ -82,7 +85,7 @@ class Diagnostics:
 
     @property
     def outside(self) -> bool:
-        """Whether many chosen actions lie outside the data's range."""
+        """Whether most chosen actions lie outside the data."""
         return self.outside_share > OUTSIDE
 
     def metrics(self) -> dict[str, float]:
@@ -107,8 +110,9 @@ def diagnose(loss: BCQLoss, data: TensorDictBase, *, num_candidates: int = 100) 
     each averaged over states and dimensions. If :math:`a` and :math:`a_i` have one distribution,
     both have the same expectation.
 
-    The range of the data's actions is measured around each state's mean candidate. Their plain
-    range would be that of all actions as soon as the demonstrator's noise reaches the bounds.
+    An action's distance to :math:`\bar a` is the root mean square over its dimensions, each in
+    units of the data's deviation. The plain range of the data's actions would not do instead: it is
+    that of all actions as soon as the demonstrator's noise reaches the bounds.
 
     PyTorch's random state is the same after the call as before.
 
@@ -133,23 +137,29 @@ def diagnose(loss: BCQLoss, data: TensorDictBase, *, num_candidates: int = 100) 
     half = (loss.action_high - loss.action_low) / 2
     half = torch.where(half > 0, half, 1.0)
     with torch.random.fork_rng([action.device] if action.device.type == "cuda" else []):
-        proposals = loss.propose(states, max(num_candidates, 2))  # a single one has no spread
+        proposals = loss.propose(states, max(num_candidates, FEWEST))
     candidates = proposals.get(key)
     count, mean = candidates.shape[1], candidates.mean(1)
     spread = (candidates.var(1) / half**2).mean().sqrt()
-    deviation = ((action - mean) / half).square().mean().sqrt() * (count / (count + 1)) ** 0.5
     policy = BCQPolicy.frozen(loss, num_candidates=num_candidates)
     chosen = policy.choose(proposals[:, :num_candidates])
     value, best = (loss.qvalue(states.copy().set(key, x))[0] for x in (action, chosen))
-    usual = (action - mean).abs().quantile(USUAL, 0)
+    deviation = _rms((action - mean) / half)
+    scale = _rms((action - mean) / half, 0).clamp(min=1e-6) * half
+    usual, distance = (_rms((x - mean) / scale, -1) for x in (action, chosen))
+    distance = distance * ((count + 1) / (count - 1)) ** 0.5  # a chosen action is part of the mean
     return Diagnostics(
         candidate_spread=spread.item(),
-        spread_ratio=(spread / deviation).item(),
+        spread_ratio=(spread / deviation / (count / (count + 1)) ** 0.5).item(),
         qvalue_gap=(best - value).mean().item(),
         qvalue_std=value.std().item(),
-        outside_share=((chosen - mean).abs() > usual).float().mean().item(),
+        outside_share=(distance > usual.quantile(USUAL)).float().mean().item(),
         latent_kl=_latent_kl(loss, data),
     )
+
+
+def _rms(x: Tensor, dim: int | None = None) -> Tensor:
+    return x.square().mean(dim).sqrt()
 
 
 def _latent_kl(loss: BCQLoss, data: TensorDictBase) -> tuple[float, ...] | None:
@@ -207,6 +217,15 @@ def read_diagnostics(path: str | os.PathLike[str]) -> dict[int, Diagnostics]:
 
     Raises:
         DataError: if the file is missing, or a column or a value is not valid.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "diagnostics.csv"
+        >>> numbers = dict.fromkeys(("qvalue_gap", "qvalue_std", "outside_share"), 0.5)
+        >>> found = Diagnostics(candidate_spread=0.1, spread_ratio=1.0, latent_kl=None, **numbers)
+        >>> write_diagnostics(path, found, epoch=2, update=2000)
+        >>> list(read_diagnostics(path))
+        [2000]
     """
     rows = read_rows(path, _COLUMNS)
     return {
@@ -249,9 +268,10 @@ def outside_message(found: Mapping[str, Diagnostics]) -> str:
     if not shares:
         return ""
     return (
-        f"{', '.join(shares)} choose actions that the demonstrations do not contain "
-        f"(outside_share {_span(shares)}, above {OUTSIDE}), which may fool the critics; try a "
-        "lower evaluate.num_candidates, a higher bcq.kl_weight or a bcq.latent_clip"
+        f"{', '.join(shares)}: most chosen actions are unlike the demonstrations (outside_share "
+        f"{_span(shares)}, above {OUTSIDE}), so the critics may be fooled; try fewer candidates "
+        "(evaluate.num_candidates, bcq.num_candidates) or a narrower generator (a higher "
+        "bcq.kl_weight, bcq.latent_clip=0.5)"
     )
 
 
