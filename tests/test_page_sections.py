@@ -13,9 +13,11 @@ import pytest
 for extra in ("scipy", "matplotlib", "jinja2", "sklearn"):
     pytest.importorskip(extra)
 
+from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.evaluation import ResultRow, write_results
 from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.reports import Section, Table, figures, write_report, write_study
+from torchrl_bmrl.training.diagnostics import Diagnostics, write_diagnostics
 
 TITLES = {"pour": "Pouring water", "lift": "Lifting"}
 """In the run's order, which is neither that of the rows nor that of the names."""
@@ -120,3 +122,50 @@ def test_the_explorer_has_the_runs_titles(tmp_path: Path) -> None:
     )
     explorer = explore_demonstrations(tmp_path, embeddings, titles=TITLES)
     assert explorer.titles == ["Pouring water"]
+
+
+def diagnosed(ratio: float, share: float = 0.01, kl: Any = None) -> Diagnostics:
+    return Diagnostics(
+        candidate_spread=0.0123,
+        spread_ratio=ratio,
+        qvalue_gap=0.5,
+        qvalue_std=2.0,
+        outside_share=share,
+        latent_kl=kl,
+    )
+
+
+def test_the_page_shows_the_last_diagnostics_of_every_agent(tmp_path: Path) -> None:
+    agents = {
+        "pour": (diagnosed(0.9), diagnosed(0.051, kl=(0.02, 0.001, 0.5))),
+        "lift": (diagnosed(1.0), diagnosed(1.7, share=0.7)),
+        "lift-1": (diagnosed(0.1), diagnosed(0.96)),
+        "lift-3": (diagnosed(0.1), diagnosed(0.1)),  # of no agent of the run
+    }
+    for name, epochs in agents.items():
+        for epoch, found in enumerate(epochs, 1):
+            path = tmp_path / "bcq" / name / "diagnostics.csv"
+            write_diagnostics(path, found, epoch=epoch, update=500 * epoch)
+    page = write_report(tmp_path, facts={}, titles=TITLES).read_text(encoding="utf-8")
+    _, _, stage = page.partition(f"<h2>{STAGE_1}</h2>")
+    assert "Candidates and critics of stage 1" in stage.partition("</section>")[0]
+    table = (tmp_path / "tables" / "diagnostics.csv").read_text(encoding="utf-8")
+    assert table.splitlines() == [
+        "Agent,Update,Spread,Spread ratio,Value gap,Outside,Active latents,Finding",
+        "Pouring water,1000,0.012,0.05,+0.25,1%,2 of 3,clones the demonstrations",
+        "Lifting,1000,0.012,1.70,+0.25,70%,–,leaves the demonstrations",
+        '"Lifting, 1",1000,0.012,0.96,+0.25,1%,–,–',
+    ]
+
+
+def test_a_page_without_diagnostics_has_no_table_of_them(page: str, tmp_path: Path) -> None:
+    assert "Candidates and critics" not in page
+    assert not (tmp_path / "tables" / "diagnostics.csv").exists()
+
+
+def test_a_file_of_diagnostics_that_is_not_one_is_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "bcq" / "lift" / "diagnostics.csv"
+    write_diagnostics(path, diagnosed(1.0), epoch=1, update=500)
+    path.write_text(path.read_text().replace("0.0123", "much"))
+    with pytest.raises(DataError, match=r"diagnostics\.csv: candidate_spread: .*'much'"):
+        write_report(tmp_path, facts={}, titles=TITLES)

@@ -27,7 +27,7 @@ from torchrl_bmrl.training.checkpoint import load_checkpoint
 pytestmark = [pytest.mark.robosuite, pytest.mark.slow]
 
 LIFT = ("bcq/lift/*", "logs/bcq_lift/scalars/*")
-"""Stage 1's files of lift: checkpoints (newest, the one before, best), evaluations, metrics."""
+"""Stage 1's files of lift: checkpoints (newest, the one before, best), rows of epochs, metrics."""
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_stage_1_resumed_equals_never_stopped(
     # The checkpoint's updates are reported at once and are not trained again.
     assert counted == ([kept] if kept else []) + [1] * (12 - (kept or 0))
     expected = contents(finished, *LIFT)
-    assert len(expected) == 4 + 7
+    assert len(expected) == 5 + 14
     assert contents(collected_run, *LIFT) == expected
 
 

@@ -69,7 +69,7 @@ def test_a_stack_resumed_equals_one_never_stopped(
     train_job((made, AGENTS), counted.append)
     assert sum(counted) == 12 * len(AGENTS)
     expected = contents(stacked, "bcq/**/*")
-    assert len(expected) == 2 + 3 * len(AGENTS)
+    assert len(expected) == 2 + 4 * len(AGENTS)
     assert contents(collected_run, "bcq/**/*") == expected
 
 

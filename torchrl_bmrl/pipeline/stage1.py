@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from statistics import fmean
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -24,10 +26,20 @@ from torchrl_bmrl.pipeline.settings import Settings
 from torchrl_bmrl.pipeline.training_data import training_data
 from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
 from torchrl_bmrl.run.workers import Report
+from torchrl_bmrl.training.diagnostics import (
+    collapse_message,
+    diagnose,
+    outside_message,
+    read_diagnostics,
+    write_diagnostics,
+)
 from torchrl_bmrl.training.fit import Every, fit
 from torchrl_bmrl.training.update import decay, keep_freed_memory
 
 log = logging.getLogger(__name__)
+
+DIAGNOSED = 128
+"""Transitions on which each agent is diagnosed after every epoch."""
 
 
 def stage1(run: Run) -> None:
@@ -62,6 +74,7 @@ def stage1(run: Run) -> None:
         description="stage 1: training BCQ",
         unit="update",
     )
+    _log_diagnostics(run, agents)
 
 
 def train_job(job: tuple[Run, dict[str, str]], report: Report) -> None:
@@ -80,7 +93,7 @@ def train_job(job: tuple[Run, dict[str, str]], report: Report) -> None:
         buffer = make_replay_buffer(datasets[0], **options)
     else:
         buffer = make_multi_task_replay_buffer(datasets, **options)
-    train_agents(run, agents, buffer, report, sizes=sizes_of(datasets[0]))
+    train_agents(run, agents, buffer, report, datasets=datasets)
 
 
 def sizes_of(data: TensorDictBase) -> dict[str, int]:
@@ -89,7 +102,12 @@ def sizes_of(data: TensorDictBase) -> dict[str, int]:
 
 
 def train_agents(
-    run: Run, agents: dict[str, str], buffer: ReplayBuffer, report: Report, *, sizes: dict[str, int]
+    run: Run,
+    agents: dict[str, str],
+    buffer: ReplayBuffer,
+    report: Report,
+    *,
+    datasets: Sequence[TensorDictBase],
 ) -> None:
     """Trains agents on samples of a buffer, or resumes from their checkpoint.
 
@@ -98,14 +116,14 @@ def train_agents(
         agents: the task of each agent by the agent's name.
         buffer: samples are ``[batch]`` for one agent and ``[agents, batch]`` for several.
         report: called with the number of new updates.
-        sizes: ``observation_dim`` and ``action_dim``.
+        datasets: the transitions of each agent, ``[N_i]``, on which it is diagnosed.
 
     Raises:
         BMRLError: naming the agents that diverged, after the others are trained.
     """
     keep_freed_memory()
     settings, bcq = run.settings, run.settings.bcq
-    trained = Agents(run, agents, sizes)
+    trained = Agents(run, agents, sizes_of(datasets[0]))
     trained.load()
     if trained.updates:
         log.debug("bcq %s: resumed from update %d", ", ".join(agents), trained.updates)
@@ -120,6 +138,11 @@ def train_agents(
                 loggers[name] = logger
                 stack.callback(close_logger, logger)
 
+            samples = {
+                name: _sample(run, name, data.select(*trained.loss.in_keys))
+                for name, data in zip(agents, datasets, strict=True)
+            }
+
             def check(
                 update: int, metrics: dict[str, Tensor], batch: TensorDictBase, logging: bool
             ) -> None:
@@ -132,6 +155,12 @@ def train_agents(
                         decay(optimizer, bcq.lr, update, total)
                 return choose(update)(batch)
 
+            def end_epoch(update: int) -> None:
+                for name in trained.healthy:
+                    _diagnose(run, trained, name, samples[name], loggers[name], update)
+                if run.playable:
+                    _evaluate_epoch(run, trained, update)
+
             fit(
                 step,
                 lambda: buffer.sample().select(*trained.loss.in_keys, STEPS_KEY, strict=False),
@@ -140,15 +169,46 @@ def train_agents(
                 every=Every(
                     log=settings.log_interval,
                     save=settings.checkpoint_interval,
-                    evaluate=bcq.updates_per_epoch if run.playable else None,
+                    evaluate=bcq.updates_per_epoch,
                 ),
                 check=check,
-                evaluate=lambda update: _evaluate_epoch(run, trained, update),
+                evaluate=end_epoch,
                 save=trained.save,
                 report=lambda updates: report(updates * len(agents)),
             )
     if trained.diverged:
         raise BMRLError("; ".join(trained.diverged.values()))
+
+
+def _sample(run: Run, name: str, data: TensorDictBase) -> TensorDictBase:
+    """Returns the transitions on which an agent is diagnosed."""
+    generator = torch.Generator().manual_seed(run.seed("diagnose", name))
+    rows = torch.randperm(len(data), generator=generator)[:DIAGNOSED]
+    return data[rows].to(run.settings.device)
+
+
+def _diagnose(
+    run: Run, trained: Agents, name: str, sample: TensorDictBase, logger: Any, update: int
+) -> None:
+    """Logs and saves an agent's diagnostics after an epoch."""
+    count = run.settings.evaluate.num_candidates
+    found = diagnose(trained.agent(name), sample, num_candidates=count)
+    log_metrics(logger, found.metrics(), update)
+    epoch = update // run.settings.bcq.updates_per_epoch
+    path = run.agent_path(name).with_name("diagnostics.csv")
+    write_diagnostics(path, found, epoch=epoch, update=update)
+
+
+def _log_diagnostics(run: Run, agents: Iterable[str]) -> None:
+    """Logs what the last diagnostics of all agents mean, in one line for each finding."""
+    files = {name: run.agent_path(name).with_name("diagnostics.csv") for name in agents}
+    found = {name: read_diagnostics(path) for name, path in files.items() if path.is_file()}
+    last = {name: rows[max(rows)] for name, rows in found.items() if rows}
+    # The published settings collapse, which is no fault of the run: no warning.
+    if message := collapse_message(last):
+        log.info("stage 1: %s", message)
+    if message := outside_message(last):
+        log.warning("stage 1: %s", message)
 
 
 def _evaluate_epoch(run: Run, trained: Agents, update: int) -> None:

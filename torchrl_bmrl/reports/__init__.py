@@ -15,7 +15,8 @@ from torchrl_bmrl.reports.explorer import Explorer
 from torchrl_bmrl.reports.figures import behaviour_trajectories, stage1_curves, success_curves
 from torchrl_bmrl.reports.page import Picture, Section, write_page
 from torchrl_bmrl.reports.paper import table_1, table_2
-from torchrl_bmrl.reports.report import read_stage1_curves, write_report
+from torchrl_bmrl.reports.report import write_report
+from torchrl_bmrl.reports.stage1 import read_stage1_curves
 from torchrl_bmrl.reports.studies import read_studies, write_study
 from torchrl_bmrl.reports.tables import (
     Table,

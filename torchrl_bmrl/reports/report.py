@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.evaluation.results import Summary, read_results, summarise
-from torchrl_bmrl.files import finite, read_rows, whole, write_atomic
+from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.reports import paper
 from torchrl_bmrl.reports.drawing import FEWEST_MAPPED
 from torchrl_bmrl.reports.embedding import (
@@ -27,8 +27,13 @@ from torchrl_bmrl.reports.embedding_figures import (
     embedding_tsne,
 )
 from torchrl_bmrl.reports.explorer import Explorer
-from torchrl_bmrl.reports.figures import Curve, stage1_curves
 from torchrl_bmrl.reports.page import Picture, Section, write_page
+from torchrl_bmrl.reports.stage1 import (
+    diagnostics_table,
+    draw_stage1,
+    read_stage1_curves,
+    read_stage1_diagnostics,
+)
 from torchrl_bmrl.reports.studies import read_studies
 from torchrl_bmrl.reports.tables import (
     Table,
@@ -37,30 +42,6 @@ from torchrl_bmrl.reports.tables import (
     stages_table,
     task_titles,
 )
-
-_CURVE_COLUMNS = {"epoch": whole, "update": whole, "return": finite}
-
-
-def read_stage1_curves(run_dir: Path, tasks: Iterable[str]) -> dict[str, Curve]:
-    """Reads ``bcq/<task>/evaluations.csv`` of a run folder, for those tasks that have one.
-
-    Args:
-        run_dir: Run folder.
-        tasks: Names of the tasks.
-
-    Returns:
-        Evaluations by task: epoch, update and returns, in the order of the epochs.
-
-    Raises:
-        DataError: if a file lacks a column, or a value is not a finite number.
-
-    Example:
-        >>> read_stage1_curves(Path("no-such-run"), ["lift"])
-        {}
-    """
-    files = {task: run_dir / "bcq" / task / "evaluations.csv" for task in tasks}
-    curves = {task: _read_curve(path) for task, path in files.items() if path.is_file()}
-    return {task: curve for task, curve in curves.items() if curve}
 
 
 def write_report(
@@ -86,7 +67,7 @@ def write_report(
     Args:
         run_dir: Run folder, with ``results.csv`` if episodes were evaluated, and
             ``bcq/<task>/evaluations.csv`` (columns epoch, update, episode, return, success) for the
-            training curves.
+            training curves, and ``bcq/<task>/diagnostics.csv`` for the table of diagnostics.
         facts: Names and values for the box at the top of the page.
         titles: Titles by task, in the order of the run's tasks; other tasks follow, with titles
             made from their names.
@@ -124,8 +105,9 @@ def write_report(
     )
     summaries = summarise(rows, titles)
     curves = read_stage1_curves(run_dir, titles)
+    diagnosed = read_stage1_diagnostics(run_dir, titles)
     studies = read_studies(run_dir)
-    if not (rows or curves or studies or tables or embeddings):
+    if not (rows or curves or diagnosed or studies or tables or embeddings):
         raise DataError(results, None, "contains no episode, and there is nothing else to report")
     returns = {}
     if rows:
@@ -135,11 +117,12 @@ def write_report(
             "table1": paper.table_1(summaries, titles=titles, epochs=epochs),
             "table2": paper.table_2(summaries, titles=titles, default_source=default_source),
         }
-    stage1, note1 = _draw_stage1(curves, summaries, titles)
+    stage1, note1 = draw_stage1(curves, summaries, titles)
     stage2, note2 = _draw_embeddings(embeddings, training, titles, seed=seed)
     measures, drawn, note3 = _measure_embeddings(embeddings, training, titles, seed=seed)
+    agents = {"diagnostics": diagnostics_table(diagnosed)} if diagnosed else {}
 
-    for name, table in {**returns, **(tables or {}), **measures}.items():
+    for name, table in {**returns, **agents, **(tables or {}), **measures}.items():
         write_atomic(run_dir / "tables" / f"{name}.md", table.markdown())
         write_atomic(run_dir / "tables" / f"{name}.csv", table.csv())
     for name, picture in {**stage1, **stage2, **drawn}.items():
@@ -153,12 +136,12 @@ def write_report(
             tables=list((tables or {}).values()),
         )
     ]
-    if returns or curves:
+    if returns or curves or agents:
         sections.append(
             Section(
                 heading="Stage 1: one BCQ policy per task",
                 paragraphs=note1,
-                tables=[returns["table1"]] if returns else [],
+                tables=[*([returns["table1"]] if returns else []), *agents.values()],
                 pictures=list(stage1.values()),
             )
         )
@@ -260,29 +243,6 @@ def _successes(summaries: Sequence[Summary], titles: Mapping[str, str]) -> str:
         f"solved {successes} of {episodes} episodes (least often on {titles[summary.task]}: "
         f"{worst:.0%})"
     )
-
-
-def _draw_stage1(
-    curves: Mapping[str, Curve], summaries: Sequence[Summary], titles: Mapping[str, str]
-) -> tuple[dict[str, Picture], list[str]]:
-    """Draws the training curves, and names the tasks that have none."""
-    if not curves:
-        return {}, ["The figure of training curves is left out: no evaluations were found."]
-    missing = [title for task, title in titles.items() if task not in curves]
-    note = [f"No training curve was found for {', '.join(missing)}."] if missing else []
-    experts = {s.task: s.mean_return for s in summaries if s.policy == "expert"}
-    return {
-        "stage1_curves": Picture(
-            png=stage1_curves(curves, titles=titles, expert_means=experts),
-            alt="Return against training epoch, one panel per task",
-            caption=(
-                "Return of the BCQ policy, rolled out after each training epoch: mean over the "
-                "episodes, and a band of one standard deviation to either side. Dashed: mean "
-                "return of the expert whose demonstrations it learns from. Compare the paper's "
-                "figure 3 (push tasks)."
-            ),
-        )
-    }, note
 
 
 def _draw_embeddings(
@@ -391,10 +351,3 @@ def _measure_embeddings(
         )
         break
     return tables, pictures, notes
-
-
-def _read_curve(path: Path) -> Curve:
-    epochs: dict[tuple[int, int], list[float]] = {}
-    for row in read_rows(path, _CURVE_COLUMNS):
-        epochs.setdefault((row["epoch"], row["update"]), []).append(row["return"])
-    return [(epoch, update, np.array(epochs[epoch, update])) for epoch, update in sorted(epochs)]

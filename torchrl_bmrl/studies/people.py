@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+import torch
 
 from torchrl_bmrl.data import make_mixed_replay_buffer
 from torchrl_bmrl.data.convert import convert, find_format
@@ -22,7 +23,7 @@ from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.pipeline.collect import collect
 from torchrl_bmrl.pipeline.evaluate import evaluate_once
 from torchrl_bmrl.pipeline.run import Run
-from torchrl_bmrl.pipeline.stage1 import sizes_of, train_agents
+from torchrl_bmrl.pipeline.stage1 import train_agents
 from torchrl_bmrl.pipeline.training_data import training_data
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
@@ -136,14 +137,16 @@ def train_job(job: Job, report: Report) -> None:
     scripted = run.transitions(task.name, "train")
     raw = read_demonstrations(run.folder.parent / "demonstrations.hdf5", task, index=0)
     human = transform_data(raw, task, run.statistics).select(*scripted.keys(True, True))
+    parts, weights = training_data([scripted, human], run.settings.bcq), [1 - share, share]
     buffer = make_mixed_replay_buffer(
-        training_data([scripted, human], run.settings.bcq),
-        weights=[1 - share, share],
+        parts,
+        weights=weights,
         batch_size=run.settings.bcq.batch_size,
         device=run.settings.device,
     )
     agents = {f"{task.name}-human{share:g}-{seed}": task.name}
-    train_agents(run, agents, buffer, report, sizes=sizes_of(scripted))
+    used = [data for data, weight in zip(parts, weights, strict=True) if weight]
+    train_agents(run, agents, buffer, report, datasets=[torch.cat(used)])
 
 
 def evaluate_job(job: Job, report: Report) -> list[dict[str, Any]]:
