@@ -13,6 +13,7 @@ import pytest
 import reference
 import torch
 from helpers import NO_UPDATER
+from reference_rebrac import rebrac
 from reference_update import (
     ACTION_DIM,
     BOUNDS,
@@ -241,7 +242,7 @@ def compare_rebrac(
     data["next", "action"] = transitions(ROWS)["action"]
     parts = {"qvalue": ("qvalue_network",), "actor": ("actor_network",)}
     library = library_update(loss, data, parts)
-    expected = reference.rebrac(
+    expected = rebrac(
         library.state,
         plain(data) | {"next_action": data["next", "action"].numpy()},
         draws(action=(ROWS, ACTION_DIM)),
