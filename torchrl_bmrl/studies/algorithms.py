@@ -29,7 +29,7 @@ from torchrl.modules import (
 )
 from torchrl.objectives import BCLoss, CQLLoss, IQLLoss, LossModule, TD3BCLoss
 
-from torchrl_bmrl.data import NStep, best_episodes, with_next_action
+from torchrl_bmrl.data import best_episodes, with_next_action
 from torchrl_bmrl.data.n_step import STEPS_KEY
 from torchrl_bmrl.errors import ConfigError, UnknownNameError
 from torchrl_bmrl.modules import make_qvalue_network
@@ -258,7 +258,7 @@ def make_loss(
     if "qvalue_network" in OBJECTIVES[algorithm]:
         loss.make_value_estimator(gamma=gamma)
     if algorithm == "iql":
-        # TorchRL's loss drops what lies beside "next", where NStep writes the number of steps.
+        # TorchRL's loss drops what lies beside "next", such as the number of steps.
         loss.value_estimator.set_keys(steps_to_next_obs=("next", STEPS_KEY))
     return loss, actor
 
@@ -267,9 +267,6 @@ def training_data(
     algorithm: str,
     data: TensorDictBase,
     coefficients: Mapping[str, float],
-    *,
-    gamma: float,
-    n_steps: int = 1,
 ) -> TensorDictBase:
     """The transitions that an algorithm learns from.
 
@@ -277,15 +274,11 @@ def training_data(
         algorithm: one of :data:`ALGORITHMS`.
         data: a task's transitions in order of time, ``[N]``.
         coefficients: those that differ from the published ones, by name.
-        gamma: discount of the rewards.
-        n_steps: rewards in the critics' target.
     """
-    if (change := DATA.get(algorithm)) is not None:
-        data = change(data, **_of(change, coefficients))
-    if n_steps > 1:  # the next action, if there is one, becomes that after the last step
-        data = NStep(n_steps, gamma)(data)
-        data.set(("next", STEPS_KEY), data[STEPS_KEY])
-    return data
+    if algorithm not in DATA:
+        return data
+    change = DATA[algorithm]
+    return change(data, **_of(change, coefficients))
 
 
 def _of(function: Callable[..., Any], options: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -29,8 +29,8 @@ from torchrl_bmrl.pipeline.evaluate import evaluate_job as evaluate_stages
 from torchrl_bmrl.pipeline.evaluate import evaluate_once
 from torchrl_bmrl.pipeline.learners import choose_updates, loss_options
 from torchrl_bmrl.pipeline.run import Run
-from torchrl_bmrl.pipeline.stage1 import sizes_of
-from torchrl_bmrl.pipeline.stage1 import training_data as stage_1_data
+from torchrl_bmrl.pipeline.stage1 import make_policy, sizes_of
+from torchrl_bmrl.pipeline.training_data import training_data as stage_1_data
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
 from torchrl_bmrl.run.folder import open_run, other_setting
@@ -98,6 +98,8 @@ def baselines(run: Run, settings: BaselineSettings) -> str:
     run.statistics  # noqa: B018 (missing demonstrations are found before anything is written)
     total = settings.updates or stage_1_updates(run)
     names = [name for name in BASELINES if name in settings.algorithms]
+    if ONE_HOT in names:
+        run.check_single_actions(f"baselines.algorithms with {ONE_HOT}")
     coefficients = {name: dict(settings.coefficients.get(name, {})) for name in names}
     trained = [
         (name, task, total, coefficients[name])
@@ -313,18 +315,18 @@ def make_buffer(
     run: Run, algorithm: str, task: str, coefficients: Coefficients | None = None
 ) -> ReplayBuffer:
     """The demonstrations that an algorithm learns from, with one row of the batch per task."""
-    datasets, bcq = [], run.settings.bcq
+    datasets, bcq = [], replace(run.settings.bcq, action_chunk=1)
     for index, name in enumerate(run.names):
         if task not in (name, ALL_TASKS):
             continue
+        data = training_data(algorithm, run.transitions(name, "train"), coefficients or {})
+        # After the next actions, which become those after the last of the n steps.
+        (data,) = stage_1_data([data], bcq)
         if algorithm == ONE_HOT:
-            data = stage_1_data(run, name)
             transform = Compose(*one_hot_task(index, len(run.names)))
             data = transform(data.copy()).set("next", transform(data["next"].copy()))
-        else:
-            options: dict[str, Any] = {"gamma": bcq.gamma, "n_steps": bcq.n_steps}
-            data = run.transitions(name, "train")
-            data = training_data(algorithm, data, coefficients or {}, **options)
+        if bcq.n_steps > 1:
+            data.set(("next", STEPS_KEY), data[STEPS_KEY])  # for IQL, see make_loss
         datasets.append(data)
     return make_multi_task_replay_buffer(
         datasets, batch_size=bcq.batch_size, device=run.settings.device
@@ -376,8 +378,7 @@ def evaluate_job(
     def play(seeds: list[int]) -> list[EpisodeOutcome]:
         transforms = []
         if algorithm == "bcq":
-            count = run.settings.evaluate.num_candidates
-            policy: TensorDictModuleBase = BCQPolicy.frozen(run.teacher(name), num_candidates=count)
+            policy: TensorDictModuleBase = make_policy(run.teacher(name), run.settings)
         else:
             task = ALL_TASKS if algorithm == ONE_HOT else name
             learner = Learner(run, algorithm, task, coefficients)
