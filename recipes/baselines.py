@@ -2,9 +2,11 @@
 
     python recipes/baselines.py run_dir=runs/mine             # after recipes/collect.py
     python recipes/baselines.py run_dir=runs/mine "baselines.algorithms=[bc,bcq_one_hot]"
+    python recipes/baselines.py run_dir=runs/mine +baselines.coefficients.td3_bc.alpha=1
 
-TorchRL's BC, TD3+BC, IQL and CQL, one policy per task, and one BCQ for all tasks whose observation
-contains the task's one-hot index. The same command resumes a run that was stopped.
+BC, BC of the best episodes, TD3+BC, ReBRAC, IQL and CQL, one policy per task, and one BCQ for all
+tasks whose observation contains the task's one-hot index. The same command resumes a run that was
+stopped.
 """
 
 from __future__ import annotations

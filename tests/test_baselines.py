@@ -63,9 +63,11 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def make_learner(folder: Path, algorithm: str, **bcq: Any) -> Learner:
+def make_learner(
+    folder: Path, algorithm: str, coefficients: dict[str, float] | None = None, **bcq: Any
+) -> Learner:
     task = ALL_TASKS if algorithm == "bcq_one_hot" else "lift"
-    return Learner(make_run(folder, **bcq), algorithm, task)
+    return Learner(make_run(folder, **bcq), algorithm, task, coefficients)
 
 
 ACTION = torch.linspace(-0.6, 0.6, ACTION_DIM)
@@ -82,7 +84,7 @@ def one_action(rows: int, algorithm: str, seed: int = 0) -> TensorDict:
     reward = 1 - (action - ACTION).square().sum(-1, keepdim=True)
     flags = {"done": never, "terminated": never.clone()}
     data = {"observation": now, "action": action}
-    data |= {"next": {"observation": after, "reward": reward, **flags}}
+    data |= {"next": {"observation": after, "action": action.clone(), "reward": reward, **flags}}
     return TensorDict(data, [rows])
 
 
@@ -110,7 +112,9 @@ def test_an_update_moves_every_network_and_every_target(collected: Path, algorit
     assert {name for name in before if torch.equal(before[name], after[name])} == set()
     expected = {
         "bc": {"actor_network"},
+        "bc_best": {"actor_network"},
         "td3_bc": {"actor_network", "qvalue_network"},
+        "rebrac": {"actor_network", "qvalue_network"},
         "iql": {"actor_network", "qvalue_network", "value_network"},
         "cql": {"actor_network", "qvalue_network"},
         "bcq_one_hot": {"generator", "qvalue_network"},
@@ -118,7 +122,9 @@ def test_an_update_moves_every_network_and_every_target(collected: Path, algorit
     assert {name for name in after if not name.startswith("target_")} == expected
     assert {name for name in after if name.startswith("target_")} == {
         "bc": set(),
+        "bc_best": set(),
         "td3_bc": {"target_actor_network", "target_qvalue_network"},
+        "rebrac": {"target_actor_network", "target_qvalue_network"},
     }.get(algorithm, {"target_qvalue_network"})
     if algorithm == "cql":
         assert learner.loss.log_alpha.item() != 0
@@ -128,7 +134,7 @@ def test_an_update_moves_every_network_and_every_target(collected: Path, algorit
 @pytest.mark.parametrize("algorithm", BASELINES)
 def test_a_policy_comes_to_do_what_the_demonstrator_does(collected: Path, algorithm: str) -> None:
     learner = make_learner(collected, algorithm, lr=0.003, gamma=0.0)
-    total = {"td3_bc": 600}.get(algorithm, 200)
+    total = {"td3_bc": 600, "rebrac": 600}.get(algorithm, 200)
     step, states = learner.make_step(total), one_action(64, algorithm).select("observation")
 
     def error() -> float:
@@ -143,12 +149,15 @@ def test_a_policy_comes_to_do_what_the_demonstrator_does(collected: Path, algori
     assert error() < 0.25 * before
 
 
-def test_td3_bc_moves_its_actor_and_targets_at_every_other_update(collected: Path) -> None:
-    learner = make_learner(collected, "td3_bc")
+@pytest.mark.parametrize("algorithm", ["td3_bc", "rebrac"])
+def test_the_actor_and_targets_of_td3_move_at_every_other_update(
+    collected: Path, algorithm: str
+) -> None:
+    learner = make_learner(collected, algorithm)
     step, moved = learner.make_step(100), []
     for update in (1, 2, 3):
         before = networks(learner)
-        step(update, one_action(8, "td3_bc"))
+        step(update, one_action(8, algorithm))
         after = networks(learner)
         moved.append({name for name in before if not torch.equal(before[name], after[name])})
     assert moved[0] == moved[2] == {"qvalue_network"}
@@ -191,7 +200,7 @@ def test_cqls_candidates_differ_within_a_state(
         assert (observations == observations[:, :1]).all()
 
 
-@pytest.mark.parametrize("algorithm", ["td3_bc", "iql", "cql", "bcq_one_hot"])
+@pytest.mark.parametrize("algorithm", ["td3_bc", "rebrac", "iql", "cql", "bcq_one_hot"])
 def test_the_discount_is_that_of_stage_1(collected: Path, algorithm: str) -> None:
     learner = make_learner(collected, algorithm, gamma=0.5)
     assert learner.loss.value_estimator.gamma.item() == 0.5
@@ -244,7 +253,7 @@ def test_training_resumed_equals_never_stopped(
     jobs = []
     for name in ("whole", "stopped"):
         shutil.copytree(collected / "data", tmp_path / name / "data")
-        jobs.append((make_run(tmp_path / name), (algorithm, task, 12)))
+        jobs.append((make_run(tmp_path / name), (algorithm, task, 12, {})))
     train_job(jobs[0], lambda _: None)
     with pytest.raises(error):
         train_job(jobs[1], Interruption(update, error))
@@ -281,7 +290,7 @@ def test_every_baseline_plays_the_evaluations_starts_and_a_repeated_call_redoes_
         text = baselines(run, BaselineSettings())  # others join
         starts = [[run.seed("evaluate", task, i) for i in range(2)] for task in TASKS]
     assert [seeds for _, seeds in played] == starts * len(BASELINES)
-    assert [size - OBSERVATION_DIM for size, _ in played] == [0] * 8 + [2, 2]
+    assert [size - OBSERVATION_DIM for size, _ in played] == [0] * 12 + [2, 2]
 
     rows = read_results(folder / "baselines.csv")
     assert [(row.policy, row.task, row.episode) for row in rows] == [
@@ -293,9 +302,15 @@ def test_every_baseline_plays_the_evaluations_starts_and_a_repeated_call_redoes_
     ]
     lines = (folder / "tables" / "baselines.csv").read_text().splitlines()
     assert lines[0] == 'Policy,Reach,Lift,"Success, all",95% interval,Episodes'
-    assert lines[1] == 'BCQ,–,"7.5, 100%",100%,"[100%, 100%]",1'
-    assert [line.split(",")[0] for line in lines[2:6]] == ["BC", "TD3+BC", "IQL", "CQL"]
+    assert lines[1].startswith("Expert,")
+    assert lines[2] == 'BCQ,–,"7.5, 100%",100%,"[100%, 100%]",1'
+    names = ["BC", '"BC, best episodes"', "TD3+BC", "ReBRAC", "IQL", "CQL", '"BCQ, one-hot task"']
+    assert all(line.startswith(f"{n},") for line, n in zip(lines[3:], names, strict=True))
     assert (folder / "studies" / "baselines.json").exists()
+    paired = (folder / "tables" / "baselines_paired.csv").read_text().splitlines()
+    assert paired[0] == "Policy,Reference,Mean over tasks,Reach,Lift"
+    assert {line.rpartition("%")[0] != "" for line in paired[3:]} == {True}
+    assert (folder / "studies" / "baselines_paired.json").exists()
     assert "12 updates each" in text
     assert (folder / "results.csv").read_bytes() == before
 

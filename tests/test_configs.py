@@ -21,6 +21,7 @@ from helpers import (
     OBSERVATION_DIM,
     TASK_LATENT_DIM,
     discrete_transitions,
+    guide,
     run,
     task_transitions,
     transitions,
@@ -52,6 +53,7 @@ GROUP = {
     "fqe": "FQELoss",
     "meta_distillation": "MetaDistillationLoss",
     "plas": "PLASLoss",
+    "rebrac": "ReBRACLoss",
     "stacked": "StackedLoss",
 }
 SIZES = {"observation_dim": OBSERVATION_DIM, "action_dim": ACTION_DIM}
@@ -107,6 +109,11 @@ NETWORKS: dict[str, dict[str, Any]] = {
             "shape": [ACTION_DIM],
         },
     },
+    "ReBRACLoss": {
+        "actor_network": torchrl(["observation"], "action", OBSERVATION_DIM, ACTION_DIM),
+        "qvalue_network": [CRITIC, TORCHRL_CRITIC],
+        "bounds": [-1.0, 1.0],
+    },
     "StackedLoss": {
         "losses": [
             {
@@ -126,6 +133,7 @@ DATA = {
     "FQELoss": lambda: transitions(4, dtype=torch.float32),
     "MetaDistillationLoss": lambda: task_transitions(2, 4, dtype=torch.float32),
     "PLASLoss": lambda: transitions(4, dtype=torch.float32),
+    "ReBRACLoss": lambda: guide().next_actions(4, dtype=torch.float32),
     "StackedLoss": lambda: transitions(2, 4, dtype=torch.float32),
 }
 

@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,13 +39,17 @@ from torchrl_bmrl.testing.contract.compiled import check_compiled
 from torchrl_bmrl.testing.measures import refused
 
 pytestmark = pytest.mark.filterwarnings(NO_UPDATER)
+REBRAC: Case = guide().TestReBRACLoss.case
 OFFLINE = {
     "bcq": bcq_case(),
     "bcq_perturbed": bcq_case(perturbation=True),
     "plas": plas_case(),
     "plas_perturbed": plas_case(perturbation=True),
     "emaq_of_the_guide": guide().TestEMaQLoss.case,
-    "rebrac_of_the_guide": guide().TestReBRACLoss.case,
+    "rebrac": REBRAC,
+    "rebrac_not_normalised": replace(
+        REBRAC, options=REBRAC.options | {"normalise_q": False}, mixes_rows=False
+    ),
     "discrete_bcq": discrete_bcq_case(),
     "discrete_bcq_categorical": discrete_bcq_case("categorical"),
     "fqe": fqe_case(),
@@ -109,8 +114,7 @@ def test_every_loss_of_the_library_has_a_case() -> None:
     losses = {getattr(objectives, name) for name in objectives.__all__ if name.endswith("Loss")}
     losses -= {objectives.StackedLoss}  # holds the others; tests/test_stacked.py goes over CASES
     bases = {base for loss in losses for base in loss.__mro__[1:]}
-    shown = {guide().EMaQLoss, guide().ReBRACLoss}
-    assert losses - bases == {type(case.make()) for case in CASES.values()} - shown
+    assert losses - bases == {type(case.make()) for case in CASES.values()} - {guide().EMaQLoss}
 
 
 def test_keys_have_the_same_order_in_another_process() -> None:
@@ -149,18 +153,21 @@ def test_inductor_gives_the_same_values() -> None:
 
 SPEC = Bounded(low=torch.tensor([-1.0, -2.0]), high=torch.tensor([0.5, 3.0]), shape=(2,))
 VAE = ("bcq", "plas")
+BOUNDED = (*VAE, "rebrac")
 BAD_OPTIONS = [
     (CASES, {"reduction": "avg"}, "'avg'; valid .*: mean, sum, none"),
     (OFFLINE, {"loss_function": "huber"}, "'huber'; valid .*: l2, l1, smooth_l1"),
     (VAE, {"lmbda": 1.5}, "lmbda is 1.5; valid: between 0 and 1"),
     (VAE, {"lmbda": -0.1}, "lmbda is -0.1; valid: between 0 and 1"),
     (VAE, {"kl_reduction": "max"}, "'max'; valid .*: mean, sum"),
-    (VAE, {"bounds": None}, "either action_spec or bounds; got neither"),
-    (VAE, {"action_spec": SPEC}, "either action_spec or bounds; got both"),
-    (VAE, {"bounds": (1.0, -1.0)}, "lower bound .*1.* above the upper bound .*-1"),
-    (VAE, {"bounds": None, "action_spec": Unbounded((2,))}, "Unbounded.*; valid: Bounded"),
+    (BOUNDED, {"bounds": None}, "either action_spec or bounds; got neither"),
+    (BOUNDED, {"action_spec": SPEC}, "either action_spec or bounds; got both"),
+    (BOUNDED, {"bounds": (1.0, -1.0)}, "lower bound .*1.* above the upper bound .*-1"),
+    (BOUNDED, {"bounds": None, "action_spec": Unbounded((2,))}, "Unbounded.*; valid: Bounded"),
     (["bcq"], {"num_candidates": 0}, "num_candidates is 0; valid: at least 1"),
     (["bcq"], {"value_bounds": (1.0, 0.0)}, r"value_bounds are \(1.0, 0.0\); valid: \(low, high"),
+    (["rebrac"], {"actor_penalty": -0.1}, "actor_penalty is -0.1; valid: at least 0"),
+    (["rebrac"], {"critic_penalty": -0.1}, "critic_penalty is -0.1; valid: at least 0"),
     (["discrete_bcq"], {"threshold": 1.5}, "threshold is 1.5; valid: between 0 and 1"),
     (["discrete_bcq"], {"action_space": "box"}, "'box'; valid .*: one-hot, categorical"),
     (STUDENTS, {"context": "next"}, "'next'; valid .*: current, previous, random, set"),

@@ -15,6 +15,7 @@ from helpers import (
     NO_UPDATER,
     OBSERVATION_DIM,
     discrete_transitions,
+    guide,
     make_bcq_loss,
     make_discrete_bcq_loss,
     make_discrete_network,
@@ -105,6 +106,14 @@ def test_actions_outside_the_bounds_are_refused_at_the_first_batch(make: Any) ->
         make()(data)
     data["action"][5, 1] = 1.0 + 1e-6  # rounding
     make()(data)
+
+
+@pytest.mark.parametrize("key", ["action", ("next", "action")])
+def test_actions_that_rebrac_compares_outside_the_bounds_are_refused(key: Any) -> None:
+    data = guide().next_actions(8)
+    data[key][5, 1] = 1.9
+    with refused(r"'action'.* holds 1 numbers outside the bounds, the first, 1.9, at \(5, 1\)"):
+        guide().TestReBRACLoss.case.make()(data)
 
 
 def test_teachers_and_students_of_other_bounds_are_refused() -> None:

@@ -13,7 +13,9 @@ import pytest
 import reference
 import torch
 from helpers import NO_UPDATER
+from reference_rebrac import rebrac
 from reference_update import (
+    ACTION_DIM,
     BOUNDS,
     CANDIDATES,
     LATENT_DIM,
@@ -40,7 +42,7 @@ from reference_update import (
 )
 from torch import nn
 
-from torchrl_bmrl.objectives import BCQLoss, DiscreteBCQLoss, PLASLoss
+from torchrl_bmrl.objectives import BCQLoss, DiscreteBCQLoss, PLASLoss, ReBRACLoss
 
 pytestmark = pytest.mark.filterwarnings(NO_UPDATER)
 
@@ -203,6 +205,75 @@ def test_one_update_of_plas_is_that_of_the_equations(
 )
 def test_a_slightly_different_plas_does_not_agree(wrong: dict[str, Any]) -> None:
     assert max(compare_plas(perturbation=True, wrong=wrong).values()) > 1e-5
+
+
+# -- ReBRAC ----------------------------------------------------------------------------------------
+
+REBRAC = {
+    "gamma": 0.97,
+    "actor_penalty": 0.3,
+    "critic_penalty": 0.2,
+    "normalise_q": True,
+    "policy_noise": 0.4,
+    "noise_clip": 0.5,
+    "loss_function": "l2",
+}
+REBRAC_VARIANTS = [
+    {},
+    {"normalise_q": False},
+    {"actor_penalty": 0.0, "critic_penalty": 0.0},
+    {"num_critics": 1},
+    {"num_critics": 3, "loss_function": "smooth_l1"},
+]
+
+
+def compare_rebrac(
+    *, num_critics: int = 2, wrong: dict[str, Any] | None = None, **options: Any
+) -> Differences:
+    torch.manual_seed(5)
+    actor = Network(OBSERVATION_DIM, ACTION_DIM, torch.tanh)
+    loss = ReBRACLoss(
+        module(actor, ["observation"], "action"),
+        [make_critic() for _ in range(num_critics)],
+        bounds=BOUNDS,
+        **(REBRAC | options),
+    )
+    data = transitions(ROWS)
+    data["next", "action"] = transitions(ROWS)["action"]
+    parts = {"qvalue": ("qvalue_network",), "actor": ("actor_network",)}
+    library = library_update(loss, data, parts)
+    expected = rebrac(
+        library.state,
+        plain(data) | {"next_action": data["next", "action"].numpy()},
+        draws(action=(ROWS, ACTION_DIM)),
+        bounds=tuple(bound.numpy() for bound in BOUNDS),
+        **(REBRAC | options | (wrong or {})),
+    )
+    return differences(library, snapshot(loss), expected)
+
+
+@pytest.mark.parametrize("options", REBRAC_VARIANTS, ids=name_of)
+def test_one_update_of_rebrac_is_that_of_the_equations(
+    options: dict[str, Any], record_property: Record
+) -> None:
+    report("ReBRACLoss", compare_rebrac(**options), record_property)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"gamma": 0.96},
+        {"actor_penalty": 0.31},
+        {"critic_penalty": 0.21},
+        {"normalise_q": False},
+        {"policy_noise": 0.41},
+        {"noise_clip": 0.3},
+        {"loss_function": "smooth_l1"},
+    ],
+    ids=name_of,
+)
+def test_a_slightly_different_rebrac_does_not_agree(wrong: dict[str, Any]) -> None:
+    assert max(compare_rebrac(wrong=wrong).values()) > 1e-5
 
 
 # -- discrete BCQ ----------------------------------------------------------------------------------

@@ -33,6 +33,7 @@ __all__ = [
     "FQELossConfig",
     "MetaDistillationLossConfig",
     "PLASLossConfig",
+    "ReBRACLossConfig",
     "StackedLossConfig",
 ]
 
@@ -73,7 +74,7 @@ def _configuration(loss: type) -> Any:
     config = make_dataclass(
         name, fields, bases=(LossConfig,), namespace={"__module__": __name__, "__doc__": doc}
     )
-    group = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=BCQ)(?=L)", "_", loss.__name__).lower()
+    group = re.sub(r"(?<=[a-z]{2})(?=[A-Z])|(?<=BCQ)(?=L)", "_", loss.__name__).lower()
     group = group.removesuffix("_loss").removesuffix("loss")
     store = ConfigStore.instance()
     store.store(group="loss", name=group, node=config, provider="torchrl_bmrl")
@@ -85,4 +86,5 @@ DiscreteBCQLossConfig = _configuration(objectives.DiscreteBCQLoss)
 FQELossConfig = _configuration(objectives.FQELoss)
 MetaDistillationLossConfig = _configuration(objectives.MetaDistillationLoss)
 PLASLossConfig = _configuration(objectives.PLASLoss)
+ReBRACLossConfig = _configuration(objectives.ReBRACLoss)
 StackedLossConfig = _configuration(objectives.StackedLoss)

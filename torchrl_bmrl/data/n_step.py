@@ -109,9 +109,9 @@ class NStep(nn.Module):
         if tensordict.get(STEPS_KEY, None) is not None:
             raise BMRLError(f"the data have {STEPS_KEY!r} already; valid: transitions of one step")
         data = tensordict.copy()
-        ends = self._ends(data)
+        ends = episode_ends(data, self.done_key, self.terminated_key)
         # gamma ** i is a Python number: rewards keep their dtype, and float64 its precision.
-        single = self._outcome(data, self.reward_key)[..., 0]
+        single = _outcome(data, self.reward_key, number=True)[..., 0]
         reward, steps = single.clone(), torch.ones_like(ends, dtype=torch.int64)
         alive = torch.ones_like(ends)
         for i in range(1, self.n_steps):
@@ -129,41 +129,58 @@ class NStep(nn.Module):
         data.set(self.reward_key, reward.unsqueeze(-1))
         return data.set(STEPS_KEY, steps.unsqueeze(-1))
 
-    def _ends(self, data: TensorDictBase) -> Tensor:
-        """Steps that are the last of every row that contains them, ``(*B, T)``."""
-        ends = self._outcome(data, self.done_key)[..., 0].clone()
-        if data.get(self.terminated_key, None) is not None:
-            ends |= self._outcome(data, self.terminated_key)[..., 0]
-        for key in EPISODE_KEYS:
-            if (number := data.get(key, None)) is not None:
-                number = _check_tensor(key, number).reshape(*ends.shape, -1)
-                ends[..., :-1] |= (number[..., 1:, :] != number[..., :-1, :]).any(-1)
-        for key in MASK_KEYS:
-            if (mask := data.get(key, None)) is not None:
-                mask = _check_tensor(key, mask)
-                if mask.dtype != torch.bool or mask.numel() != ends.numel():
-                    raise BMRLError(
-                        f"{key!r} is {mask.dtype} {tuple(mask.shape)}; valid: torch.bool "
-                        f"{tuple(ends.shape)}, False for padding"
-                    )
-                padding = ~mask.reshape(ends.shape)
-                ends |= padding
-                ends[..., :-1] |= padding[..., 1:]
-        return ends
 
-    def _outcome(self, data: TensorDictBase, key: NestedKey) -> Tensor:
-        """The reward or a flag, ``(*B, T, 1)``."""
-        value = data.get(key, None)
-        if value is None:
-            raise missing(data, key)
-        value, shape = _check_tensor(key, value), (*data.batch_size, 1)
-        if value.shape != shape:
-            raise BMRLError(f"{key!r} has the shape {tuple(value.shape)}; valid: {shape}")
-        number = key == self.reward_key
-        if not (value.is_floating_point() if number else value.dtype == torch.bool):
-            valid = "floating-point numbers" if number else "torch.bool"
-            raise BMRLError(f"{key!r} is {value.dtype}; valid: {valid}")
-        return value
+def episode_ends(
+    data: TensorDictBase,
+    done_key: NestedKey = ("next", "done"),
+    terminated_key: NestedKey = ("next", "terminated"),
+) -> Tensor:
+    """Steps after which the data have no further step of the same episode, ``(*B, T)`` bool.
+
+    An episode ends at its flags, before its number changes and before padding, as described at
+    :class:`NStep`. The last row of the data is not marked.
+
+    Args:
+        data: transitions in order of time along the last batch dimension.
+        done_key: flag of an episode's end, ``(*B, T, 1)`` bool.
+        terminated_key: flag of a termination, which the data may lack.
+
+    Raises:
+        BMRLError: for data without ``done_key``, or a flag or mask of another shape or type.
+    """
+    ends = _outcome(data, done_key)[..., 0].clone()
+    if data.get(terminated_key, None) is not None:
+        ends |= _outcome(data, terminated_key)[..., 0]
+    for key in EPISODE_KEYS:
+        if (number := data.get(key, None)) is not None:
+            number = _check_tensor(key, number).reshape(*ends.shape, -1)
+            ends[..., :-1] |= (number[..., 1:, :] != number[..., :-1, :]).any(-1)
+    for key in MASK_KEYS:
+        if (mask := data.get(key, None)) is not None:
+            mask = _check_tensor(key, mask)
+            if mask.dtype != torch.bool or mask.numel() != ends.numel():
+                raise BMRLError(
+                    f"{key!r} is {mask.dtype} {tuple(mask.shape)}; valid: torch.bool "
+                    f"{tuple(ends.shape)}, False for padding"
+                )
+            padding = ~mask.reshape(ends.shape)
+            ends |= padding
+            ends[..., :-1] |= padding[..., 1:]
+    return ends
+
+
+def _outcome(data: TensorDictBase, key: NestedKey, *, number: bool = False) -> Tensor:
+    """The reward, a ``number``, or a flag, ``(*B, T, 1)``."""
+    value = data.get(key, None)
+    if value is None:
+        raise missing(data, key)
+    value, shape = _check_tensor(key, value), (*data.batch_size, 1)
+    if value.shape != shape:
+        raise BMRLError(f"{key!r} has the shape {tuple(value.shape)}; valid: {shape}")
+    if not (value.is_floating_point() if number else value.dtype == torch.bool):
+        valid = "floating-point numbers" if number else "torch.bool"
+        raise BMRLError(f"{key!r} is {value.dtype}; valid: {valid}")
+    return value
 
 
 def rows_later(steps: Tensor) -> tuple[Tensor, ...]:

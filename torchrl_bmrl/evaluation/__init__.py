@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torchrl_bmrl.evaluation.paired import paired_difference
 from torchrl_bmrl.evaluation.results import (
     POLICIES,
     RESULT_FIELDS,
@@ -26,6 +27,7 @@ __all__ = [
     "ResultRow",
     "Summary",
     "bootstrap_interval",
+    "paired_difference",
     "probability_of_improvement",
     "rank_correlation",
     "read_results",

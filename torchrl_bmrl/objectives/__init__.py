@@ -8,6 +8,7 @@ from torchrl_bmrl.objectives.distillation import MetaDistillationLoss
 from torchrl_bmrl.objectives.fqe import FQELoss
 from torchrl_bmrl.objectives.generative import GenerativeLoss
 from torchrl_bmrl.objectives.plas import PLASLoss
+from torchrl_bmrl.objectives.rebrac import ReBRACLoss
 from torchrl_bmrl.objectives.stacked import StackedLoss
 
 __all__ = [
@@ -19,5 +20,6 @@ __all__ = [
     "MetaDistillationLoss",
     "OfflineLoss",
     "PLASLoss",
+    "ReBRACLoss",
     "StackedLoss",
 ]

@@ -97,9 +97,12 @@ def evaluate_once(
     play: Callable[[list[int]], list[EpisodeOutcome]],
     *,
     source: str = "",
+    development: bool = False,
     report: Report,
 ) -> list[ResultRow]:
     """Plays the evaluation's episodes of one task, policy and source of m, or loads their file.
+
+    The files are in the folder ``evaluation``, those of development starts in ``development``.
 
     Args:
         run: the run.
@@ -107,13 +110,15 @@ def evaluate_once(
         policy: name of the policy in tables.
         play: plays one episode for each of the given seeds.
         source: source of m, for the distilled policy.
+        development: whether to start from other seeds than the evaluation's, for tuning.
         report: called with the number of steps if the episodes are loaded.
     """
+    starts, folder = ("dev", "development") if development else ("evaluate", "evaluation")
     name = "-".join(filter(None, (task, policy, source)))
     episodes = run.settings.evaluate.episodes
 
     def make(path: Path) -> None:
-        outcomes = play([run.seed("evaluate", task, i) for i in range(episodes)])
+        outcomes = play([run.seed(starts, task, i) for i in range(episodes)])
         rows = [
             ResultRow(
                 task=task,
@@ -130,7 +135,7 @@ def evaluate_once(
         log.debug("%s: mean return %.1f", path, fmean(row.episode_return for row in rows))
 
     return run.once(
-        f"evaluation/{name}.csv",
+        f"{folder}/{name}.csv",
         read_results,
         make,
         skipped=lambda: report(episodes * run.horizon(run.task(task))),

@@ -1,11 +1,13 @@
-"""Offline algorithms of TorchRL with their published coefficients and order of updates.
+"""Offline algorithms with their published coefficients and order of updates.
 
-Their losses read ``observation`` and ``action`` in [-1, 1]. A policy acts without noise under
-``ExplorationType.DETERMINISTIC``.
+BC, TD3+BC, IQL and CQL are TorchRL's losses, ReBRAC is this library's. They read ``observation``
+and ``action`` in [-1, 1]. A policy acts without noise under ``ExplorationType.DETERMINISTIC``.
 """
 
 from __future__ import annotations
 
+import inspect
+import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -27,8 +29,12 @@ from torchrl.modules import (
 )
 from torchrl.objectives import BCLoss, CQLLoss, IQLLoss, LossModule, TD3BCLoss
 
+from torchrl_bmrl.data import best_episodes, with_next_action
+from torchrl_bmrl.data.n_step import STEPS_KEY
+from torchrl_bmrl.errors import ConfigError, UnknownNameError
 from torchrl_bmrl.modules import make_qvalue_network
 from torchrl_bmrl.modules.generator import make_mlp
+from torchrl_bmrl.objectives import ReBRACLoss
 
 Algorithm = tuple[LossModule, TensorDictModuleBase]
 """A loss and the policy that it trains."""
@@ -37,7 +43,7 @@ Objective = Callable[[Any, TensorDictBase], Tensor]
 CELLS = (256, 256)
 """Widths of every network's hidden layers by default."""
 ACTOR_INTERVAL = 2
-"""Updates of TD3+BC's critics for each update of its actor and its targets."""
+"""Updates of the critics of TD3+BC and ReBRAC for each update of their actor and targets."""
 IMITATION = 0.04
 """Share of CQL's updates, at the start, in which the actor imitates."""
 
@@ -51,10 +57,15 @@ def make_actor(
 
 
 def make_critics(
-    observation_dim: int, action_dim: int, cells: Sequence[int] = CELLS
+    observation_dim: int,
+    action_dim: int,
+    cells: Sequence[int] = CELLS,
+    *,
+    layer_norm: bool = False,
 ) -> list[TensorDictModule]:
     """Two critics."""
-    return [make_qvalue_network(observation_dim, action_dim, num_cells=cells) for _ in range(2)]
+    options: dict[str, Any] = {"num_cells": cells, "layer_norm": layer_norm}
+    return [make_qvalue_network(observation_dim, action_dim, **options) for _ in range(2)]
 
 
 def bc(observation_dim: int, action_dim: int, cells: Sequence[int] = CELLS) -> Algorithm:
@@ -65,27 +76,66 @@ def bc(observation_dim: int, action_dim: int, cells: Sequence[int] = CELLS) -> A
     return BCLoss(actor), actor
 
 
-def td3_bc(observation_dim: int, action_dim: int, cells: Sequence[int] = CELLS) -> Algorithm:
+def td3_bc(
+    observation_dim: int,
+    action_dim: int,
+    cells: Sequence[int] = CELLS,
+    *,
+    layer_norm: bool = False,
+    alpha: float = 2.5,
+) -> Algorithm:
     """TD3 with an imitation term."""
     actor = make_actor(observation_dim, action_dim, cells)
-    critics = make_critics(observation_dim, action_dim, cells)
-    return TD3BCLoss(actor, critics, bounds=(-1.0, 1.0), loss_function="l2"), actor
+    critics = make_critics(observation_dim, action_dim, cells, layer_norm=layer_norm)
+    options: dict[str, Any] = {"bounds": (-1.0, 1.0), "alpha": alpha, "loss_function": "l2"}
+    return TD3BCLoss(actor, critics, **options), actor
 
 
-def iql(observation_dim: int, action_dim: int, cells: Sequence[int] = CELLS) -> Algorithm:
+def rebrac(
+    observation_dim: int,
+    action_dim: int,
+    cells: Sequence[int] = CELLS,
+    *,
+    actor_penalty: float = 0.1,
+    critic_penalty: float = 0.1,
+) -> Algorithm:
+    """TD3 with penalties on actor and critics, whose critics always have layer normalisation."""
+    actor = make_actor(observation_dim, action_dim, cells)
+    critics = make_critics(observation_dim, action_dim, cells, layer_norm=True)
+    options: dict[str, Any] = {"actor_penalty": actor_penalty, "critic_penalty": critic_penalty}
+    return ReBRACLoss(actor, critics, bounds=(-1.0, 1.0), **options), actor
+
+
+def iql(
+    observation_dim: int,
+    action_dim: int,
+    cells: Sequence[int] = CELLS,
+    *,
+    layer_norm: bool = False,
+    temperature: float = 3.0,
+    expectile: float = 0.7,
+) -> Algorithm:
     """Expectile values and advantage-weighted imitation."""
     mean = make_actor(observation_dim, action_dim, cells).module
     network = nn.Sequential(mean, AddStateIndependentNormalScale(action_dim))
     keys = ["loc", "scale"]
     network = TensorDictModule(network, in_keys=["observation"], out_keys=keys)
     actor = ProbabilisticActor(network, in_keys=keys, distribution_class=IndependentNormal)
-    value = make_mlp(observation_dim, 1, cells)
+    critics = make_critics(observation_dim, action_dim, cells, layer_norm=layer_norm)
+    value = make_mlp(observation_dim, 1, cells, layer_norm=layer_norm)
     value = TensorDictModule(value, in_keys=["observation"], out_keys=["state_value"])
-    options = {"temperature": 3.0, "expectile": 0.7, "loss_function": "l2"}
-    return IQLLoss(actor, make_critics(observation_dim, action_dim, cells), value, **options), actor
+    options = {"temperature": temperature, "expectile": expectile, "loss_function": "l2"}
+    return IQLLoss(actor, critics, value, **options), actor
 
 
-def cql(observation_dim: int, action_dim: int, cells: Sequence[int] = CELLS) -> Algorithm:
+def cql(
+    observation_dim: int,
+    action_dim: int,
+    cells: Sequence[int] = CELLS,
+    *,
+    layer_norm: bool = False,
+    min_q_weight: float = 5.0,
+) -> Algorithm:
     """SAC with a penalty on the critics' values of actions that the data does not contain.
 
     The fixed weight of 5 is the published one without a Lagrange multiplier. TorchRL's
@@ -104,8 +154,8 @@ def cql(observation_dim: int, action_dim: int, cells: Sequence[int] = CELLS) -> 
     )
     loss = CQLLoss(
         actor,
-        make_critics(observation_dim, action_dim, cells),
-        min_q_weight=5.0,
+        make_critics(observation_dim, action_dim, cells, layer_norm=layer_norm),
+        min_q_weight=min_q_weight,
         num_random=10,
         target_entropy=-float(action_dim),
         loss_function="l2",
@@ -113,8 +163,128 @@ def cql(observation_dim: int, action_dim: int, cells: Sequence[int] = CELLS) -> 
     return loss, actor
 
 
-ALGORITHMS = {build.__name__: build for build in (bc, td3_bc, iql, cql)}
+ALGORITHMS: Mapping[str, Callable[..., Algorithm]] = {
+    "bc": bc,
+    "bc_best": bc,
+    "td3_bc": td3_bc,
+    "rebrac": rebrac,
+    "iql": iql,
+    "cql": cql,
+}
 """Functions of the sizes of observation and action that return a loss and its policy, by name."""
+DATA: Mapping[str, Callable[..., TensorDictBase]] = {
+    "bc_best": best_episodes,
+    "rebrac": with_next_action,
+}
+"""Functions that turn a task's transitions into the training data, for the others the identity."""
+
+
+# -- coefficients ----------------------------------------------------------------------------------
+
+
+def published(algorithm: str) -> dict[str, float]:
+    """The coefficients of an algorithm with their published values.
+
+    They are the numbers among the defaults of the functions in :data:`ALGORITHMS` and :data:`DATA`.
+
+    Example:
+        >>> published("iql"), published("bc_best"), published("bcq_one_hot")
+        ({'temperature': 3.0, 'expectile': 0.7}, {'share': 0.1}, {})
+    """
+    found = {}
+    for functions in (ALGORITHMS, DATA):
+        if algorithm in functions:
+            for name, parameter in inspect.signature(functions[algorithm]).parameters.items():
+                if isinstance(parameter.default, float):
+                    found[name] = parameter.default
+    return found
+
+
+def check_coefficients(given: Mapping[str, Mapping[str, Any]], prefix: str) -> None:
+    """Checks the names and values of coefficients.
+
+    Args:
+        given: coefficients by name, by algorithm.
+        prefix: name of the setting, for messages.
+
+    Raises:
+        UnknownNameError: for an unknown algorithm.
+        ConfigError: for an unknown coefficient, or a value that is not a number of at least 0; a
+            share and an expectile are at most 1.
+
+    Example:
+        >>> check_coefficients({"td3_bc": {"beta": 1.0}}, "coefficients")
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.ConfigError: coefficients.td3_bc has 'beta'; valid: alpha
+    """
+    for algorithm, values in given.items():
+        if algorithm not in ALGORITHMS:
+            raise UnknownNameError(f"algorithm of {prefix}", algorithm, ALGORITHMS)
+        known = published(algorithm)
+        for name, value in values.items():
+            if name not in known:
+                valid = ", ".join(known) or "none"
+                raise ConfigError(f"{prefix}.{algorithm} has {name!r}; valid: {valid}")
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            high = 1.0 if name in ("share", "expectile") else math.inf
+            if not number or not math.isfinite(value) or not 0 <= value <= high:
+                span = f"between 0 and {high:g}" if high < math.inf else "at least 0"
+                raise ConfigError(f"{prefix}.{algorithm}.{name} is {value!r}; valid: {span}")
+
+
+def make_loss(
+    algorithm: str,
+    sizes: Mapping[str, int],
+    cells: Sequence[int],
+    coefficients: Mapping[str, float],
+    *,
+    gamma: float,
+    layer_norm: bool = False,
+) -> Algorithm:
+    """Makes an algorithm's loss and policy.
+
+    Args:
+        algorithm: one of :data:`ALGORITHMS`.
+        sizes: ``observation_dim`` and ``action_dim``.
+        cells: widths of every network's hidden layers.
+        coefficients: those that differ from the published ones, by name.
+        gamma: discount of the critics' target.
+        layer_norm: whether the critics' hidden layers are normalised.
+    """
+    build = ALGORITHMS[algorithm]
+    options = {**coefficients, "layer_norm": layer_norm}
+    loss, actor = build(**sizes, cells=cells, **_of(build, options))
+    if "qvalue_network" in OBJECTIVES[algorithm]:
+        loss.make_value_estimator(gamma=gamma)
+    if algorithm == "iql":
+        # TorchRL's loss drops what lies beside "next", such as the number of steps.
+        loss.value_estimator.set_keys(steps_to_next_obs=("next", STEPS_KEY))
+    return loss, actor
+
+
+def training_data(
+    algorithm: str,
+    data: TensorDictBase,
+    coefficients: Mapping[str, float],
+) -> TensorDictBase:
+    """The transitions that an algorithm learns from.
+
+    Args:
+        algorithm: one of :data:`ALGORITHMS`.
+        data: a task's transitions in order of time, ``[N]``.
+        coefficients: those that differ from the published ones, by name.
+    """
+    if algorithm not in DATA:
+        return data
+    change = DATA[algorithm]
+    return change(data, **_of(change, coefficients))
+
+
+def _of(function: Callable[..., Any], options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options that a function takes."""
+    known = inspect.signature(function).parameters
+    return {name: value for name, value in options.items() if name in known}
 
 
 # -- updates ---------------------------------------------------------------------------------------
@@ -142,9 +312,12 @@ def _cql_actor(loss: CQLLoss, batch: TensorDictBase, *, imitates: bool = False) 
     return value + loss.alpha_loss(info, mask_tensordict=batch)[0]
 
 
+_ACTOR_CRITIC = {"qvalue_network": _method("qvalue_loss"), "actor_network": _method("actor_loss")}
 OBJECTIVES: Mapping[str, Mapping[str, Objective]] = {
     "bc": {"actor_network": _bc_actor},
-    "td3_bc": {"qvalue_network": _method("qvalue_loss"), "actor_network": _method("actor_loss")},
+    "bc_best": {"actor_network": _bc_actor},
+    "td3_bc": _ACTOR_CRITIC,
+    "rebrac": _ACTOR_CRITIC,
     "iql": {
         "value_network": _method("value_loss"),
         "actor_network": _method("actor_loss"),
@@ -168,7 +341,7 @@ def objectives(algorithm: str, update: int, total: int) -> dict[str, Objective]:
         [['qvalue_network'], ['qvalue_network', 'actor_network']]
     """
     chosen = dict(OBJECTIVES[algorithm])
-    if algorithm == "td3_bc" and update % ACTOR_INTERVAL:
+    if algorithm in ("td3_bc", "rebrac") and update % ACTOR_INTERVAL:
         del chosen["actor_network"]
     if algorithm == "cql" and update <= IMITATION * total:
         chosen["actor_network"] = partial(_cql_actor, imitates=True)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -18,30 +19,35 @@ from torchrl.envs.transforms import CatTensors, Compose, Transform
 from torchrl.objectives import CQLLoss, SoftUpdate
 
 from torchrl_bmrl.data import make_multi_task_replay_buffer
-from torchrl_bmrl.evaluation import (
-    ResultRow,
-    bootstrap_interval,
-    read_results,
-    summarise,
-    write_results,
-)
-from torchrl_bmrl.evaluation.results import policy_order
+from torchrl_bmrl.data.n_step import STEPS_KEY
+from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
+from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.modules import BCQPolicy, PrototypeTaskLatent
-from torchrl_bmrl.pipeline.agents import make_bcq_loss
+from torchrl_bmrl.pipeline.agents import load_bcq_loss, make_bcq_loss
+from torchrl_bmrl.pipeline.evaluate import evaluate_job as evaluate_stages
 from torchrl_bmrl.pipeline.evaluate import evaluate_once
 from torchrl_bmrl.pipeline.learners import choose_updates, loss_options
 from torchrl_bmrl.pipeline.run import Run
-from torchrl_bmrl.pipeline.stage1 import sizes_of
+from torchrl_bmrl.pipeline.stage1 import make_policy, sizes_of
+from torchrl_bmrl.pipeline.training_data import training_data as stage_1_data
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
-from torchrl_bmrl.reports.tables import MISSING, Table, policy_name, task_titles
-from torchrl_bmrl.run.folder import open_run
+from torchrl_bmrl.run.folder import open_run, other_setting
 from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
 from torchrl_bmrl.run.settings import setting
 from torchrl_bmrl.run.workers import Report
-from torchrl_bmrl.studies.algorithms import ALGORITHMS, OBJECTIVES, objectives
-from torchrl_bmrl.training.checkpoint import resume_training, save_training
+from torchrl_bmrl.studies.algorithms import (
+    ALGORITHMS,
+    OBJECTIVES,
+    check_coefficients,
+    make_loss,
+    objectives,
+    published,
+    training_data,
+)
+from torchrl_bmrl.studies.baselines_report import make_paired_table, make_table
+from torchrl_bmrl.training.checkpoint import load_newest, resume_training, save_training
 from torchrl_bmrl.training.fit import Every, fit
 from torchrl_bmrl.training.health import check_metrics
 from torchrl_bmrl.training.update import gradient_step, keep_freed_memory, make_adam
@@ -50,6 +56,9 @@ ONE_HOT = "bcq_one_hot"
 """One BCQ agent for all tasks, whose observation contains the task's one-hot index."""
 ALL_TASKS = "all"
 BASELINES = (*ALGORITHMS, ONE_HOT)
+STARTS = ("evaluation", "development")
+Coefficients = Mapping[str, float]
+"""Coefficients of one algorithm that differ from the published ones, by name."""
 
 
 @dataclass
@@ -58,61 +67,141 @@ class BaselineSettings:
 
     algorithms: list[str] = setting(list(BASELINES), choices=BASELINES, unique=True)
     updates: int | None = setting(None, above=0)  # of each; null: as many as a stage-1 agent
+    # By algorithm and name; those that are not given are the published ones.
+    coefficients: dict[str, dict[str, Any]] = field(default_factory=dict)
+    starts: str = setting("evaluation", choices=STARTS)  # development: other seeds, for tuning
     folder: ClassVar[str] = "baselines"  # of the study, below the run's
 
 
 def baselines(run: Run, settings: BaselineSettings) -> str:
-    """Trains and evaluates the algorithms, then writes ``baselines.csv`` and a table.
+    """Trains and evaluates the algorithms, then writes ``baselines.csv`` and two tables.
 
     Every algorithm has one policy per task, except :data:`ONE_HOT`. Finished parts are read back.
+    With development starts it writes ``baselines_dev.csv`` and the tables of these episodes, which
+    the page does not show. Then the run's agents of stage 1, if they are trained, play too.
 
     Args:
-        run: an open run with demonstrations; if it has ``results.csv``, the table contains these
+        run: an open run with demonstrations; if it has ``results.csv``, the tables contain these
             policies too.
-        settings: which algorithms, and their number of updates.
+        settings: which algorithms, their coefficients and number of updates, and the starts.
 
     Returns:
-        the table as Markdown.
+        the tables as Markdown.
 
     Raises:
-        BMRLError: if demonstrations are missing, a task has no environment, or a training diverges.
+        BMRLError: if demonstrations are missing, a task has no environment, a coefficient is
+            unknown or another one than that of the finished training, or a training diverges.
     """
     run.check_open()
     run.check_playable()
+    check_coefficients(settings.coefficients, "baselines.coefficients")
     run.statistics  # noqa: B018 (missing demonstrations are found before anything is written)
-    stage_1 = run.settings.bcq.epochs * run.settings.bcq.updates_per_epoch
-    updates = settings.updates or stage_1
-    # More algorithms may join the finished ones, with the same number of updates.
-    open_run(run.folder / settings.folder, {"updates": updates})
+    total = settings.updates or stage_1_updates(run)
     names = [name for name in BASELINES if name in settings.algorithms]
+    if ONE_HOT in names:
+        run.check_single_actions(f"baselines.algorithms with {ONE_HOT}")
+    coefficients = {name: dict(settings.coefficients.get(name, {})) for name in names}
     trained = [
-        (name, task, updates)
+        (name, task, total, coefficients[name])
         for name in names
         for task in ([ALL_TASKS] if name == ONE_HOT else run.names)
     ]
+    # More algorithms may join the finished ones, with the same number of updates.
+    open_run(run.folder / settings.folder, {"updates": total})
+    for name, task, _, values in trained:
+        check_trained(run, name, task, values)
     run.jobs(
         train_job,
         trained,
-        total=len(trained) * updates,
+        total=len(trained) * total,
         description="training baselines",
         unit="update",
     )
-    played = [(name, task) for name in names for task in run.names]
+    development = settings.starts == "development"
+    also = ["bcq"] if development and has_agents(run) else []
+    played = [
+        (name, task, coefficients.get(name, {}), development)
+        for name in (*also, *names)
+        for task in run.names
+    ]
     parts = run.jobs(
         evaluate_job,
         played,
-        total=sum(run.settings.evaluate.episodes * run.horizon(run.task(t)) for _, t in played),
+        total=sum(run.settings.evaluate.episodes * run.horizon(run.task(t)) for _, t, *_ in played),
         description="evaluating baselines",
         unit="step",
     )
     rows = [row for part in parts for row in part]
-    write_results(run.folder / "baselines.csv", rows)
-    results = run.folder / "results.csv"
-    table = make_table(
-        (read_results(results) if results.exists() else []) + rows, updates, run.titles
+    file = "baselines_dev" if development else "baselines"
+    write_results(run.folder / f"{file}.csv", rows)
+    experts = run.jobs(
+        evaluate_stages,
+        [(task, "expert", "") for task in run.names],
+        total=sum(run.settings.evaluate.episodes * run.horizon(task) for task in run.tasks),
+        description="evaluating the expert",
+        unit="step",
     )
-    write_study(run.folder, "baselines", Section(heading="Baselines", tables=[table]), {})
-    return table.markdown()
+    shown = [row for part in experts for row in part]
+    results = run.folder / "results.csv"
+    if results.exists() and not development:
+        shown += [row for row in read_results(results) if row.policy != "expert"]
+    given = {name: values for name, values in coefficients.items() if values}
+    tables = {
+        file: make_table(shown + rows, total, run.titles, given),
+        f"{file}_paired": make_paired_table(shown + rows, run.titles),
+    }
+    for name, table in tables.items():
+        if development:
+            write_atomic(run.folder / "tables" / f"{name}.md", table.markdown())
+            write_atomic(run.folder / "tables" / f"{name}.csv", table.csv())
+        else:
+            heading = "Baselines" if name == file else "Baselines: paired differences"
+            write_study(run.folder, name, Section(heading=heading, tables=[table]), {})
+    return "\n".join(table.markdown() for table in tables.values())
+
+
+def stage_1_updates(run: Run) -> int:
+    """The number of updates of a stage-1 agent."""
+    return run.settings.bcq.epochs * run.settings.bcq.updates_per_epoch
+
+
+def has_agents(run: Run) -> bool:
+    """Whether the run has a finished stage-1 agent of every task."""
+    paths = [run.agent_path(name) for name in run.names]
+    return all(path.exists() for path in paths) and all(
+        load_bcq_loss(path)[1]["updates"] == stage_1_updates(run) for path in paths
+    )
+
+
+def check_trained(run: Run, algorithm: str, task: str, coefficients: Coefficients) -> None:
+    """Compares an algorithm's coefficients with those of its checkpoint, if there is one.
+
+    Args:
+        run: the run.
+        algorithm: one of :data:`BASELINES`.
+        task: name of its task, or :data:`ALL_TASKS`.
+        coefficients: those that differ from the published ones.
+
+    Raises:
+        ConfigError: naming the first one that differs.
+    """
+    saved = load_newest(checkpoint_path(run, algorithm, task), kind="baseline")
+    if saved is None:
+        return
+    now = {**published(algorithm), **coefficients}
+    before = {**published(algorithm), **saved[1].get("coefficients", {})}
+    for name in sorted(now | before):
+        if now.get(name) != before.get(name):
+            key = f"coefficients.{algorithm}.{name}"
+            raise other_setting(
+                run.folder / BaselineSettings.folder, key, now.get(name), before.get(name)
+            )
+
+
+def checkpoint_path(run: Run, algorithm: str, task: str) -> Path:
+    """The checkpoint of a baseline."""
+    name = f"{algorithm}-{task}"
+    return run.folder / BaselineSettings.folder / name / "checkpoint.safetensors"
 
 
 def one_hot_task(index: int, num_tasks: int) -> list[Transform]:
@@ -129,11 +218,15 @@ class Learner:
         run: the run.
         algorithm: one of :data:`BASELINES`.
         task: name of its task, or :data:`ALL_TASKS`.
+        coefficients: those that differ from the published ones.
     """
 
-    def __init__(self, run: Run, algorithm: str, task: str) -> None:
+    def __init__(
+        self, run: Run, algorithm: str, task: str, coefficients: Coefficients | None = None
+    ) -> None:
         self.run, self.algorithm, self.name = run, algorithm, f"{algorithm}-{task}"
-        self.path = run.folder / BaselineSettings.folder / self.name / "checkpoint.safetensors"
+        self.coefficients = dict(coefficients or {})
+        self.path = checkpoint_path(run, algorithm, task)
         sizes, bcq = sizes_of(run.transitions(run.names[0], "train")), run.settings.bcq
         torch.manual_seed(run.seed("baselines", self.name))
         if algorithm == ONE_HOT:
@@ -142,9 +235,10 @@ class Learner:
             networks = ["generator", "qvalue_network"]
             networks += ["perturbation_network"] if bcq.perturbation else []
         else:
-            self.loss, self.actor = ALGORITHMS[algorithm](**sizes, cells=bcq.num_cells)
-            if algorithm != "bc":
-                self.loss.make_value_estimator(gamma=bcq.gamma)
+            options: dict[str, Any] = {"gamma": bcq.gamma, "layer_norm": bcq.layer_norm}
+            self.loss, self.actor = make_loss(
+                algorithm, sizes, bcq.num_cells, self.coefficients, **options
+            )
             networks = list(OBJECTIVES[algorithm])
         self.loss.to(run.settings.device)
         self.optimizers = {name: make_adam(self._parameters(name), bcq.lr) for name in networks}
@@ -205,6 +299,8 @@ class Learner:
         settings = self.run.settings
         metadata = {"kind": "baseline", "name": self.name, "updates": update}
         metadata |= {"settings": settings.deciding()}
+        if self.coefficients:
+            metadata["coefficients"] = self.coefficients
         save_training(
             self.path,
             self.loss,
@@ -215,28 +311,34 @@ class Learner:
         )
 
 
-def make_buffer(run: Run, algorithm: str, task: str) -> ReplayBuffer:
+def make_buffer(
+    run: Run, algorithm: str, task: str, coefficients: Coefficients | None = None
+) -> ReplayBuffer:
     """The demonstrations that an algorithm learns from, with one row of the batch per task."""
-    datasets = []
+    datasets, bcq = [], replace(run.settings.bcq, action_chunk=1)
     for index, name in enumerate(run.names):
-        if task in (name, ALL_TASKS):
-            data = run.transitions(name, "train")
-            if algorithm == ONE_HOT:
-                transform = Compose(*one_hot_task(index, len(run.names)))
-                data = transform(data.copy()).set("next", transform(data["next"].copy()))
-            datasets.append(data)
-    settings = run.settings
+        if task not in (name, ALL_TASKS):
+            continue
+        data = training_data(algorithm, run.transitions(name, "train"), coefficients or {})
+        # After the next actions, which become those after the last of the n steps.
+        (data,) = stage_1_data([data], bcq)
+        if algorithm == ONE_HOT:
+            transform = Compose(*one_hot_task(index, len(run.names)))
+            data = transform(data.copy()).set("next", transform(data["next"].copy()))
+        if bcq.n_steps > 1:
+            data.set(("next", STEPS_KEY), data[STEPS_KEY])  # for IQL, see make_loss
+        datasets.append(data)
     return make_multi_task_replay_buffer(
-        datasets, batch_size=settings.bcq.batch_size, device=settings.device
+        datasets, batch_size=bcq.batch_size, device=run.settings.device
     )
 
 
-def train_job(job: tuple[Run, tuple[str, str, int]], report: Report) -> None:
+def train_job(job: tuple[Run, tuple[str, str, int, Coefficients]], report: Report) -> None:
     """Trains an algorithm on its demonstrations, or resumes from its checkpoint."""
-    run, (algorithm, task, total) = job
+    run, (algorithm, task, total, coefficients) = job
     keep_freed_memory()
-    settings, learner = run.settings, Learner(run, algorithm, task)
-    buffer = make_buffer(run, algorithm, task)
+    settings, learner = run.settings, Learner(run, algorithm, task, coefficients)
+    buffer = make_buffer(run, algorithm, task, coefficients)
     learner.load()  # last, since everything above draws random numbers
     if learner.updates:
         report(learner.updates)
@@ -254,9 +356,10 @@ def train_job(job: tuple[Run, tuple[str, str, int]], report: Report) -> None:
             check_metrics(metrics, f"{learner.name}, update {update}")
             log_metrics(logger if logging else None, metrics, update)
 
+        keys = [*learner.loss.in_keys, STEPS_KEY, ("next", STEPS_KEY)]
         fit(
             learner.make_step(total),
-            lambda: buffer.sample().select(*learner.loss.in_keys).reshape(-1),
+            lambda: buffer.sample().select(*keys, strict=False).reshape(-1),
             start=learner.updates,
             total=total,
             every=Every(log=settings.log_interval, save=settings.checkpoint_interval),
@@ -266,61 +369,24 @@ def train_job(job: tuple[Run, tuple[str, str, int]], report: Report) -> None:
         )
 
 
-def evaluate_job(job: tuple[Run, tuple[str, str]], report: Report) -> list[ResultRow]:
-    """The evaluation's episodes of a trained algorithm on one task."""
-    run, (algorithm, name) = job
+def evaluate_job(
+    job: tuple[Run, tuple[str, str, Coefficients, bool]], report: Report
+) -> list[ResultRow]:
+    """The episodes of a trained algorithm, or of stage 1's ``bcq``, on one task."""
+    run, (algorithm, name, coefficients, development) = job
 
     def play(seeds: list[int]) -> list[EpisodeOutcome]:
-        learner = Learner(run, algorithm, ALL_TASKS if algorithm == ONE_HOT else name)
-        learner.load()
         transforms = []
+        if algorithm == "bcq":
+            policy: TensorDictModuleBase = make_policy(run.teacher(name), run.settings)
+        else:
+            task = ALL_TASKS if algorithm == ONE_HOT else name
+            learner = Learner(run, algorithm, task, coefficients)
+            learner.load()
+            policy = learner.make_policy().to("cpu")
         if algorithm == ONE_HOT:
             transforms = one_hot_task(run.names.index(name), len(run.names))
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            policy = learner.make_policy().to("cpu")
             return run.play(run.task(name), policy, *transforms, seeds=seeds, report=report)
 
-    return evaluate_once(run, name, algorithm, play, report=report)
-
-
-def make_table(rows: Sequence[ResultRow], updates: int, titles: Mapping[str, str]) -> Table:
-    """One line per policy and one column per task.
-
-    Args:
-        rows: episodes.
-        updates: of each baseline.
-        titles: of the tasks by name, in the order of the columns.
-    """
-    found = {(s.policy, s.latent_source, s.task): s for s in summarise(rows)}
-    present = {row.task for row in rows}
-    columns = {k: x for k, x in task_titles(present, titles).items() if k in present}
-    lines = []
-    for policy, source in sorted({key[:2] for key in found}, key=lambda k: (policy_order(k[0]), k)):
-        mine = [row for row in rows if (row.policy, row.latent_source) == (policy, source)]
-        line = [policy_name(policy) + (f" ({source})" if source else "")]
-        for task in columns:
-            cell = MISSING
-            if (each := found.get((policy, source, task))) is not None:
-                cell = f"{each.mean_return:.1f}"
-                cell += "" if each.success_rate is None else f", {each.success_rate:.0%}"
-            line.append(cell)
-        successes = [float(row.success) for row in mine if row.success is not None]
-        if len(successes) == len(mine):
-            low, high = bootstrap_interval(successes, strata=[row.task for row in mine])
-            line += [f"{sum(successes) / len(mine):.0%}", f"[{low:.0%}, {high:.0%}]"]
-        else:
-            line += [MISSING, MISSING]
-        lines.append((*line, str(len(mine))))
-    return Table(
-        title="The two stages beside other offline algorithms",
-        caption=(
-            "Mean return over an episode, and success, on the same starts; the expert's are its "
-            "demonstrations unless it was evaluated. BCQ: stage 1, one agent per task. Distilled: "
-            "stage 2, with the source of m in brackets. BC, TD3+BC, IQL and CQL: TorchRL's losses, "
-            "one policy per task. BCQ, one-hot task: one agent trained on all tasks, whose "
-            f"observation contains the task's index; {updates:,} updates each. Interval: bootstrap "
-            "over the episodes of each task."
-        ),
-        header=("Policy", *columns.values(), "Success, all", "95% interval", "Episodes"),
-        rows=lines,
-    )
+    return evaluate_once(run, name, algorithm, play, development=development, report=report)
