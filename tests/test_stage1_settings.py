@@ -87,7 +87,7 @@ def test_both_stages_run_with_another_generator(tmp_path: Path, name: str, laten
 
 
 def test_a_stack_trains_agents_with_any_generator(tmp_path: Path) -> None:
-    run = trained(tmp_path, generator="flow", stacked=True, critic_rule="mean", layer_norm=True)
+    run = trained(tmp_path, generator="flow", stacked=True, acting_rule="mean", layer_norm=True)
     assert isinstance(run.teacher("drawer").generator, ActionFlow)
 
 
@@ -97,10 +97,10 @@ def test_an_option_that_the_generator_does_not_take_is_refused_by_name(tmp_path:
 
 
 def test_agents_have_the_critics_of_the_settings_also_when_loaded(tmp_path: Path) -> None:
-    options = {"num_qvalue_nets": 3, "layer_norm": True, "critic_rule": "min"}
+    options = {"num_qvalue_nets": 3, "layer_norm": True, "acting_rule": "min"}
     loss = trained(tmp_path, **options).teacher("door")
     assert loss.num_qvalue_nets == 3
-    assert loss.critic_rule == "min"
+    assert loss.acting_rule == "min"
     assert any(isinstance(part, torch.nn.LayerNorm) for part in loss.qvalue_network.modules())
 
 

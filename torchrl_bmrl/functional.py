@@ -128,29 +128,31 @@ def soft_clipped_value(state_action_value: Tensor, lmbda: float | Tensor) -> Ten
     return lmbda * state_action_value.amin(0) + (1.0 - lmbda) * state_action_value.amax(0)
 
 
-CRITIC_RULES = ("clipped", "mean", "min")
-"""Rules by which an ensemble of critics values an action; see :func:`ensemble_value`."""
+TARGET_RULES = ("clipped", "mean")
+"""Rules by which an ensemble of critics values the next state's actions in BCQ's target."""
+ACTING_RULES = ("first", "mean", "min")
+"""Rules by which an ensemble values the actions that a policy chooses among."""
 
 
 def ensemble_value(state_action_value: Tensor, rule: str) -> Tensor:
     r"""Value of an action by an ensemble of critics, for a policy that chooses among actions.
 
-    =============  =======================================================================
-    ``"clipped"``  :math:`Q_1`, the first critic, as BCQ and the paper act
-    ``"mean"``     :math:`\frac{1}{K}\sum_j Q_j`, whose error is smaller than one critic's
-    ``"min"``      :math:`\min_j Q_j`, which avoids actions that the critics disagree on
-    =============  =======================================================================
+    ===========  =======================================================================
+    ``"first"``  :math:`Q_1`, as BCQ and the paper act
+    ``"mean"``   :math:`\frac{1}{K}\sum_j Q_j`, whose error is smaller than one critic's
+    ``"min"``    :math:`\min_j Q_j`, which avoids actions that the critics disagree on
+    ===========  =======================================================================
 
     Args:
         state_action_value: Q of each critic, ``(num_qvalue_nets, *B)``.
-        rule: one of :data:`CRITIC_RULES`.
+        rule: one of :data:`ACTING_RULES`.
 
     Returns:
         ``(*B,)``.
 
     Example:
         >>> q = torch.tensor([[1.0], [3.0]])
-        >>> [ensemble_value(q, rule).item() for rule in CRITIC_RULES]
+        >>> [ensemble_value(q, rule).item() for rule in ACTING_RULES]
         [1.0, 2.0, 1.0]
     """
     if rule == "mean":

@@ -86,7 +86,7 @@ class DiscreteBCQPolicy(LossPolicy):
     @classmethod
     def _from(cls, loss: Any, live: bool, **options: Any) -> Made[DiscreteBCQPolicy]:
         generator = link(loss, "generator", live)
-        critic = link(loss, "qvalue_network", live, critic="clipped")
+        critic = link(loss, "qvalue_network", live, critic="first")
         policy = cls(
             generator.module,
             critic.module,

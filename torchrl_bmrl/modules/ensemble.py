@@ -15,7 +15,7 @@ from torchrl_bmrl.functional import ensemble_value
 class EnsembleCritic(TensorDictModuleBase):
     """Critics that value an action together, by their mean or their minimum.
 
-    A policy of a :class:`~torchrl_bmrl.objectives.BCQLoss` with ``critic_rule="mean"`` or ``"min"``
+    A policy of a :class:`~torchrl_bmrl.objectives.BCQLoss` with ``acting_rule="mean"`` or ``"min"``
     acts with it.
 
     Args:

@@ -200,7 +200,7 @@ class Link:
 def _held(loss: Any, name: str, critic: str | None) -> tuple[Any, TensorDictBase]:
     """A loss's network and its parameters; of critics the first, or all as one network."""
     if critic is not None and hasattr(loss, "critic"):
-        if critic == "clipped":
+        if critic == "first":
             return loss.critic(0)
         modules, params = zip(*map(loss.critic, range(loss.num_qvalue_nets)), strict=True)
         own = {str(i): each for i, each in enumerate(params)}

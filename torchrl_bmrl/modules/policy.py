@@ -128,7 +128,7 @@ class BCQPolicy(LossPolicy):
         generator = link(loss, f"{student}generator", live)
         # Acting needs no encoder.
         part = getattr(generator.module, "decoder", generator.module)
-        rule = getattr(loss, "critic_rule", "clipped")
+        rule = getattr(loss, "acting_rule", "first")
         critic = link(loss, f"{student}qvalue_network", live, critic=rule)
         perturbation = None if student else link(loss, "perturbation_network", live, optional=True)
         bounds = None if student else (loss.action_low, loss.action_high)

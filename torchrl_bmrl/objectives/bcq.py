@@ -10,7 +10,12 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
-from torchrl_bmrl.functional import CRITIC_RULES, bcq_next_value, ensemble_value
+from torchrl_bmrl.functional import (
+    ACTING_RULES,
+    TARGET_RULES,
+    bcq_next_value,
+    ensemble_value,
+)
 from torchrl_bmrl.objectives.checks import check_number, check_value_bounds
 from torchrl_bmrl.objectives.generative import GenerativeLoss
 
@@ -44,7 +49,7 @@ class BCQLoss(GenerativeLoss):
     - another model of the data's actions, without perturbation: EMaQ,
       https://arxiv.org/abs/2007.11091, whose N is larger when acting. Such models are
       :class:`torchrl_bmrl.modules.ActionMixture` and :class:`torchrl_bmrl.modules.ActionFlow`.
-    - :class:`torchrl_bmrl.modules.ActionFlow`, few candidates, ``critic_rule="mean"`` or ``"min"``:
+    - :class:`torchrl_bmrl.modules.ActionFlow`, few candidates, ``acting_rule="mean"`` or ``"min"``:
       best-of-N over a flow, as in Q-chunking, https://arxiv.org/abs/2507.07969, there with chunks
       of actions.
 
@@ -64,9 +69,10 @@ class BCQLoss(GenerativeLoss):
         num_qvalue_nets: number of critics; ``None`` for 2 from a single one, or the list's length.
         num_candidates: actions proposed per next state.
         lmbda: λ, weight of the critics' minimum against their maximum.
-        critic_rule: how several critics value an action. ``"clipped"``, as published: by λ in the
-            target, and by the first critic in the policy and the perturbation's loss. ``"mean"`` or
-            ``"min"``: by the mean or the minimum over the critics in all of them.
+        target_rule: how the critics value the next state's actions: ``"clipped"``, by λ as above
+            (1 is the minimum), or ``"mean"``, by their mean.
+        acting_rule: how they value actions in the policy and in the perturbation's loss: by the
+            ``"first"`` critic as above, or by the ``"mean"`` or the ``"min"`` over all.
         latent_clip: bound on the latent of proposed actions; ``None`` for none.
         value_bounds: ``(low, high)`` that the next states' value is clamped to; ``None`` for none.
             With rewards in [0, 1], (0, 1 / (1 - γ)) keeps a critic from diverging.
@@ -111,7 +117,8 @@ class BCQLoss(GenerativeLoss):
         num_qvalue_nets: int | None = None,
         num_candidates: int = 10,
         lmbda: float = 0.75,
-        critic_rule: str = "clipped",
+        target_rule: str = "clipped",
+        acting_rule: str = "first",
         latent_clip: float | None = 0.5,
         value_bounds: tuple[float, float] | None = None,
         **options: Any,
@@ -120,9 +127,11 @@ class BCQLoss(GenerativeLoss):
         self.num_candidates = check_number("num_candidates", num_candidates, 1, integer=True)
         self.value_bounds = check_value_bounds(value_bounds)
         self.register_coefficients(high=1.0, lmbda=lmbda)
-        if critic_rule not in CRITIC_RULES:
-            raise UnknownNameError("critic_rule", critic_rule, CRITIC_RULES)
-        self.critic_rule = critic_rule
+        if target_rule not in TARGET_RULES:
+            raise UnknownNameError("target_rule", target_rule, TARGET_RULES)
+        if acting_rule not in ACTING_RULES:
+            raise UnknownNameError("acting_rule", acting_rule, ACTING_RULES)
+        self.target_rule, self.acting_rule = target_rule, acting_rule
         self.convert_critics(qvalue_network, num_qvalue_nets)
         self.finish()
 
@@ -145,17 +154,17 @@ class BCQLoss(GenerativeLoss):
             after = self.rows(tensordict, self.observation_keys, after=True)
             proposals = self.perturb(self.propose(after, self.num_candidates), target=True)
             value = self.qvalue(proposals, target=True)
-            if self.critic_rule == "clipped":
-                next_value = bcq_next_value(value, self.lmbda)
+            if self.target_rule == "mean":
+                next_value = ensemble_value(value, "mean").amax(-1)
             else:
-                next_value = ensemble_value(value, self.critic_rule).amax(-1)
+                next_value = bcq_next_value(value, self.lmbda)
             if self.value_bounds is not None:
                 next_value = next_value.clamp(*self.value_bounds)
         data = self.rows(tensordict, self.qvalue_network.in_keys)
         return self.temporal_difference(tensordict, self.qvalue(data), next_value)
 
     def perturbation_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Loss of the perturbation network, -Q by ``critic_rule``; only it receives gradients.
+        """Loss of the perturbation network, -Q by ``acting_rule``; only it receives gradients.
 
         Returns:
             the loss, and no metrics.
@@ -169,5 +178,5 @@ class BCQLoss(GenerativeLoss):
             observation = self.rows(tensordict, self.observation_keys)
             proposal = self.propose(observation, 1).squeeze(-1)
         proposal = self.perturb(proposal)
-        value = ensemble_value(self.qvalue(proposal, frozen=True), self.critic_rule)
+        value = ensemble_value(self.qvalue(proposal, frozen=True), self.acting_rule)
         return self.reduce(-value, tensordict), {}

@@ -9,7 +9,7 @@ from torchrl_bmrl.data.replay import check_device
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.experts.controllers import ExpertGains
 from torchrl_bmrl.experts.settings import ExpertSettings, experts_of
-from torchrl_bmrl.functional import CRITIC_RULES
+from torchrl_bmrl.functional import ACTING_RULES, TARGET_RULES
 from torchrl_bmrl.objectives.checks import check_value_bounds
 from torchrl_bmrl.objectives.common import LOSS_FUNCTIONS
 from torchrl_bmrl.objectives.distillation import CONTEXTS, ENCODER_TERMS
@@ -76,7 +76,8 @@ class BCQSettings:
     layer_norm: bool = False  # normalises the critics' hidden layers
     num_candidates: int = setting(10, above=0)  # proposals in the critics' target
     lmbda: float = setting(0.75, at_least=0, at_most=1)  # weight of the critics' minimum
-    critic_rule: str = setting("clipped", choices=CRITIC_RULES)  # how several critics value
+    target_rule: str = setting("clipped", choices=TARGET_RULES)  # value of next actions
+    acting_rule: str = setting("first", choices=ACTING_RULES)  # value of the policy's candidates
     latent_clip: float | None = setting(0.5, above=0)  # null turns it off
     kl_weight: float = setting(0.5, at_least=0)  # weight of the KL term in the generator's loss
     kl_reduction: str = setting("mean", choices=KL_REDUCTIONS)  # reduction over the latent

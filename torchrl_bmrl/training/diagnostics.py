@@ -145,7 +145,7 @@ def diagnose(loss: BCQLoss, data: TensorDictBase, *, num_candidates: int = 100) 
     policy = BCQPolicy.frozen(loss, num_candidates=num_candidates)
     chosen = policy.choose(proposals[:, :num_candidates])
     value, best = (
-        ensemble_value(loss.qvalue(states.copy().set(key, x)), loss.critic_rule)
+        ensemble_value(loss.qvalue(states.copy().set(key, x)), loss.acting_rule)
         for x in (action, chosen)
     )
     deviation = _rms((action - mean) / half)
