@@ -211,8 +211,18 @@ def test_only_is_refused_by_a_command_that_does_not_split_its_work(
 ABLATIONS = sorted(path.stem for path in (RECIPES / "config" / "ablation").glob("*.yaml"))
 
 
-@pytest.mark.parametrize("ablation", ABLATIONS)
-@pytest.mark.parametrize("preset", ["quick", "paper"])
+OF_WEAK = {
+    *("acting_100", "acting_first", "autoencoder", "chunks_4", "critics_2", "flow", "gamma_99"),
+    *("no_layer_norm", "published", "raw_rewards", "steps_1", "steps_5"),
+}
+"""Ablations that undo a step of the preset ``weak``; others may have it undone already."""
+
+
+@pytest.mark.parametrize(
+    ("preset", "ablation"),
+    [(preset, x) for preset in ("quick", "paper") for x in ABLATIONS if x not in OF_WEAK]
+    + [("weak", x) for x in sorted(OF_WEAK)],
+)
 def test_an_ablation_is_valid_and_changes_one_group_of_settings_of_any_preset(
     recipes: Any, tmp_path: Path, preset: str, ablation: str
 ) -> None:
@@ -229,8 +239,23 @@ def test_an_ablation_is_valid_and_changes_one_group_of_settings_of_any_preset(
         assert groups == ["ablation"]
     elif ablation == "one_hot":  # acts on a point alone, where the paper preset has three sources
         assert {"ablation", "distill"} <= set(groups) <= {"ablation", "distill", "evaluate"}
+    elif ablation == "published":
+        assert groups == ["ablation", "bcq", "evaluate"]
     else:
         assert len(groups) == 2
+
+
+def test_the_published_stage_1_has_the_settings_of_the_published_presets(
+    recipes: Any, tmp_path: Path
+) -> None:
+    quick, config = (
+        settings_of(f"preset={preset}", f"ablation={name}", f"run_dir={tmp_path}")
+        for preset, name in (("quick", "none"), ("weak", "published"))
+    )
+    size = {"epochs", "batch_size"}
+    differing = {k for k, x in vars(quick.bcq).items() if x != getattr(config.bcq, k)}
+    assert differing == size
+    assert quick.evaluate.num_candidates == config.evaluate.num_candidates
 
 
 def test_what_each_ablation_takes_away_is_away(recipes: Any, tmp_path: Path) -> None:
@@ -245,7 +270,14 @@ def test_what_each_ablation_takes_away_is_away(recipes: Any, tmp_path: Path) -> 
     assert ablated("perturbation").bcq.perturbation
     assert ablated("latent_clip_none").bcq.latent_clip is None
     assert ablated("candidates_2").bcq.num_candidates == 2
-    assert [ablated(f"acting_{n}").evaluate.num_candidates for n in (1, 10)] == [1, 10]
+    assert [ablated(x).bcq.generator for x in ("autoencoder", "flow")] == ["autoencoder", "flow"]
+    assert [ablated(f"steps_{n}").bcq.n_steps for n in (1, 5)] == [1, 5]
+    assert ablated("chunks_4").bcq.action_chunk == 4
+    assert not ablated("no_layer_norm").bcq.layer_norm
+    assert not ablated("raw_rewards").bcq.standard_reward
+    assert ablated("critics_2").bcq.num_qvalue_nets == 2
+    assert ablated("gamma_99").bcq.gamma == 0.99
+    assert [ablated(f"acting_{n}").evaluate.num_candidates for n in (1, 10, 100)] == [1, 10, 100]
     assert [ablated(f"noise_{n}").collect.noise for n in (0, 40)] == [0.0, 0.4]
     for n in (10, 50, 100):
         assert set(Run(ablated(f"demos_{n}")).settings.collect.train_episodes.values()) == {n}
