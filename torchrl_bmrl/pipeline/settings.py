@@ -72,6 +72,7 @@ class BCQSettings:
     cosine: bool = False  # the learning rate decays to zero
     num_cells: list[int] = setting([256, 256], above=0)  # widths of the hidden layers
     generator: str = setting("autoencoder", choices=tuple(GENERATORS))  # model of the actions
+    tempered: bool = False  # each proposal of a flow or a mixture has a random temperature
     num_qvalue_nets: int = setting(2, above=0)  # critics of each agent
     layer_norm: bool = False  # normalises the critics' hidden layers
     num_candidates: int = setting(10, above=0)  # proposals in the critics' target
