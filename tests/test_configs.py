@@ -26,9 +26,17 @@ from helpers import (
     task_transitions,
     transitions,
 )
+from torch import nn
 
 from torchrl_bmrl import objectives
-from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
+from torchrl_bmrl.modules import (
+    ActionFlow,
+    ActionMixture,
+    ActionVAE,
+    BCQPolicy,
+    EnsembleCritic,
+    make_qvalue_network,
+)
 
 pytest.importorskip("hydra")
 from hydra import compose, initialize, initialize_config_dir
@@ -218,6 +226,20 @@ def test_a_configured_loss_computes_what_one_made_in_python_does() -> None:
     )
     data = transitions(4, dtype=torch.float32)
     torch.testing.assert_close(run(loss, data), run(expected, data.clone()), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("generator", [ActionFlow, ActionMixture])
+def test_hydra_makes_a_loss_over_each_generator_with_an_ensemble_of_critics(generator: Any) -> None:
+    networks = NETWORKS["BCQLoss"] | {
+        "generator": ours(generator.__name__, **SIZES, num_cells=list(CELLS)),
+        "qvalue_network": [CRITIC | {"layer_norm": True}] * 4,
+    }
+    loss = instantiate(configs.BCQLossConfig(**networks, target_rule="mean", acting_rule="min"))
+    assert (type(loss.generator), loss.num_qvalue_nets) == (generator, 4)
+    assert run(loss, DATA["BCQLoss"]())["loss_qvalue"].isfinite()
+    policy = BCQPolicy.frozen(loss)
+    assert isinstance(policy.qvalue_network, EnsembleCritic)
+    assert any(isinstance(layer, nn.LayerNorm) for layer in policy.modules())
 
 
 def test_networks_made_in_python_are_trained_themselves_and_not_as_copies() -> None:

@@ -11,9 +11,15 @@ from typing import Any
 import pytest
 import torch
 from helpers import (
+    BOUNDS,
+    CELLS,
+    CRITICS,
+    DIMS,
     NO_UPDATER,
+    Q,
     discrete_transitions,
     make_bcq_loss,
+    make_critics,
     make_discrete_bcq_loss,
     make_distillation_loss,
     make_plas_loss,
@@ -29,6 +35,8 @@ from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.modules import (
+    ActionFlow,
+    ActionMixture,
     ActionVAE,
     BCQPolicy,
     DiscreteBCQPolicy,
@@ -36,9 +44,21 @@ from torchrl_bmrl.modules import (
     make_qvalue_network,
 )
 from torchrl_bmrl.objectives import BCQLoss, StackedLoss
+from torchrl_bmrl.testing import Case
 
 pytestmark = pytest.mark.filterwarnings(NO_UPDATER)
 Make = Callable[..., Any]
+
+
+def case_of(make: Any) -> Case:
+    """BCQ over another generator than the autoencoder."""
+
+    def networks() -> dict[str, Any]:
+        return {"generator": make(*DIMS, num_cells=CELLS), Q: make_critics(1)[0]}
+
+    return Case(BCQLoss, networks, CRITICS, (Q,), BOUNDS)
+
+
 CASES: dict[str, tuple[Make, Any, Callable[[], TensorDict]]] = {
     "bcq": (make_bcq_loss, BCQPolicy, lambda: transitions(8)),
     "bcq_one_critic": (partial(make_bcq_loss, num_critics=1), BCQPolicy, lambda: transitions(8)),
@@ -47,6 +67,12 @@ CASES: dict[str, tuple[Make, Any, Callable[[], TensorDict]]] = {
         BCQPolicy,
         lambda: transitions(8),
     ),
+    "bcq_over_a_flow": (
+        partial(case_of(ActionFlow).make, acting_rule="min"),
+        BCQPolicy,
+        lambda: transitions(8),
+    ),
+    "bcq_over_a_mixture": (case_of(ActionMixture).make, BCQPolicy, lambda: transitions(8)),
     "plas": (partial(make_plas_loss, perturbation=True), PLASPolicy, lambda: transitions(8)),
     "discrete": (make_discrete_bcq_loss, DiscreteBCQPolicy, lambda: discrete_transitions(8)),
     "distillation": (make_distillation_loss, BCQPolicy, lambda: task_transitions(3, 5)),

@@ -13,6 +13,7 @@ from typing import Any
 
 import acting_speed
 import distillation_speed
+import generator_speed
 import pytest
 import torch
 from bcq_speed import (
@@ -117,3 +118,39 @@ def test_other_scripts_print_their_tables(script: Any, capsys: pytest.CaptureFix
     script.main(["--rounds", "1"])
     _, _, *rows = capsys.readouterr().out.strip().splitlines()
     assert len(rows) == {acting_speed: 8, distillation_speed: 4}[script]
+
+
+@pytest.mark.parametrize("generator", generator_speed.GENERATORS)
+def test_updates_per_second_with_each_generator(
+    generator: str, request: pytest.FixtureRequest
+) -> None:
+    pytest.importorskip("pytest_benchmark")
+    benchmark: Callable[..., Any] = request.getfixturevalue("benchmark")
+    benchmark.group = "generators, batch 128"
+    values = benchmark(generator_speed.updates(128, 2, 4)[generator])
+    assert torch.stack(values).isfinite().all()
+
+
+@pytest.mark.parametrize(
+    "device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)], ids=["cpu", "gpu"]
+)
+def test_every_policy_acts_within_the_bounds(device: str) -> None:
+    ways = generator_speed.acting(3, 4, device)
+    assert [*generator_speed.GENERATORS, generator_speed.STUDENT] == [
+        name for name in ways if "critics" not in name
+    ]
+    for act in ways.values():
+        action = act()
+        assert (action.shape, action.device.type) == ((3, 7), device)
+        assert action.abs().max() <= 1
+
+
+@pytest.mark.parametrize(
+    "device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)], ids=["cpu", "gpu"]
+)
+def test_a_measurement_has_a_ratio_to_the_first_for_every_way(device: str) -> None:
+    ways = generator_speed.updates(8, 2, 2, device)
+    measured = generator_speed.measure(ways, rounds=1, calls=1, device=device)
+    assert list(measured) == list(generator_speed.GENERATORS)
+    assert measured[generator_speed.FIRST][1] == 1.0
+    assert all(milliseconds > 0 for milliseconds, _ in measured.values())
