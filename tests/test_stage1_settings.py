@@ -57,7 +57,6 @@ def make(folder: Path, **bcq: Any) -> Run:
 
 
 def written(folder: Path, **bcq: Any) -> Run:
-    folder.mkdir(exist_ok=True)
     for index, name in enumerate(TASKS):
         write_file(folder / f"{name}.hdf5", [n + index for n in (5, 6, 7, 8)], parts=PARTS)
     return make(folder, **bcq)
@@ -95,18 +94,6 @@ def test_a_stack_trains_agents_with_any_generator(tmp_path: Path) -> None:
 def test_an_option_that_the_generator_does_not_take_is_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(Exception, match=r"kl_weight is 0.1, and generator ActionFlow"):
         trained(tmp_path, generator="flow", kl_weight=0.1)
-
-
-def test_tempered_agents_are_trained_and_distilled_and_an_autoencoder_refuses(
-    tmp_path: Path,
-) -> None:
-    run = trained(tmp_path / "flow", generator="flow", tempered=True)
-    with run:
-        stage2(run)
-    size = run.transitions("door", "train")["action"].shape[-1]
-    assert run.teacher("door").generator.latent_dim == run.student()[0].latent_dim == size + 1
-    with pytest.raises(ConfigError, match=r"tempered is True; valid with bcq.generator=autoenc"):
-        trained(tmp_path / "autoencoder", tempered=True)
 
 
 def test_agents_have_the_critics_of_the_settings_also_when_loaded(tmp_path: Path) -> None:

@@ -74,27 +74,6 @@ def sample_action_latent(
     return latent.clamp(-bound, bound)
 
 
-def temper(latent: Tensor) -> Tensor:
-    r"""Noise with a random temperature: :math:`\tau \epsilon` with :math:`\tau` uniform in [0, 1].
-
-    Candidates with temperatures of their own range from the demonstrator's action without noise to
-    actions with all of its noise. A critic can choose the first where noise harms and the others
-    where it helps, so that many candidates do no harm.
-
-    Args:
-        latent: z, ``(*B, n + 1)``; its first number decides :math:`\tau`, by its share of the
-            normal distribution, the others are :math:`\epsilon`.
-
-    Returns:
-        ``(*B, n)``.
-
-    Example:
-        >>> temper(torch.tensor([0.0, 1.0, -2.0]))
-        tensor([ 0.5000, -1.0000])
-    """
-    return torch.special.ndtr(latent[..., :1]) * latent[..., 1:]
-
-
 def perturbed_action(
     action: Tensor,
     perturbation: Tensor,

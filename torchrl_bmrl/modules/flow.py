@@ -10,7 +10,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.functional import squared_error, temper
+from torchrl_bmrl.functional import squared_error
 from torchrl_bmrl.generators import ActionKeys, LatentGenerator
 from torchrl_bmrl.modules.generator import BoundedModule, make_mlp, sized
 
@@ -25,16 +25,13 @@ class _EulerDecoder(BoundedModule):
         num_cells: Sequence[int],
         bounds: tuple[float | Tensor, float | Tensor],
         euler_steps: int,
-        tempered: bool,
     ) -> None:
         super().__init__(bounds)
-        self.tempered = tempered
         self.velocity = make_mlp(observation_dim + action_dim + 1, action_dim, num_cells)
         self.euler_steps = euler_steps
 
     def forward(self, observation: Tensor, latent: Tensor) -> Tensor:
-        point = temper(latent) if self.tempered else latent
-        step = 1.0 / self.euler_steps
+        point, step = latent, 1.0 / self.euler_steps
         for number in range(self.euler_steps):
             # Expanded: the network computes the part of the time once for all candidates.
             time = point.new_full((1,), number * step).expand(*point.shape[:-1], 1)
@@ -51,26 +48,23 @@ class ActionFlow(LatentGenerator):
               x_t = (1 - t)\, x_0 + t\, x_1,\quad x_0 \sim N(0, I),\quad t \sim U(0, 1),
 
     with :math:`x_1` the action, scaled to [-1, 1]. The action of a latent z is :math:`x_1` after
-    ``euler_steps`` Euler steps from :math:`x_0 = z`, clamped to the bounds. With ``tempered``, z
-    has one number more, which decides how far the action lies from the one without noise; see
-    :func:`torchrl_bmrl.functional.temper`.
+    ``euler_steps`` Euler steps from :math:`x_0 = z`, clamped to the bounds.
 
     Reference: Lipman et al., *Flow Matching for Generative Modeling*, ICLR 2023,
     https://arxiv.org/abs/2210.02747.
 
     Args:
         observation_dim: size of the observation.
-        action_dim: size of the action.
+        action_dim: size of the action, and of z.
 
     Keyword Args:
         euler_steps: steps from noise to action, each one call of the network.
-        tempered: whether each proposal has a random temperature.
         num_cells: widths of the hidden layers.
         bounds: lower and upper bound of the action, numbers or ``(action_dim,)``.
         observation_key: key of the observation.
 
     Reads ``observation (*B, observation_dim)``; ``decoder`` also reads ``action_latent
-    (*B, latent_dim)`` and writes ``action (*B, action_dim)``.
+    (*B, action_dim)`` and writes ``action (*B, action_dim)``.
 
     Raises:
         BMRLError: for ``euler_steps`` below one.
@@ -91,19 +85,15 @@ class ActionFlow(LatentGenerator):
         action_dim: int,
         *,
         euler_steps: int = 8,
-        tempered: bool = False,
         num_cells: Sequence[int] = (256, 256),
         bounds: tuple[float | Tensor, float | Tensor] = (-1.0, 1.0),
         observation_key: NestedKey = "observation",
     ) -> None:
         if euler_steps < 1:
             raise BMRLError(f"euler_steps is {euler_steps}; valid: at least 1")
-        network = _EulerDecoder(
-            observation_dim, action_dim, num_cells, bounds, euler_steps, tempered
-        )
-        latent_dim = action_dim + tempered
-        reads = {observation_key: observation_dim, "action_latent": latent_dim}
-        super().__init__(sized(network, reads, {"action": action_dim}), latent_dim)
+        network = _EulerDecoder(observation_dim, action_dim, num_cells, bounds, euler_steps)
+        reads = {observation_key: observation_dim, "action_latent": action_dim}
+        super().__init__(sized(network, reads, {"action": action_dim}), action_dim)
         self.in_keys = [observation_key]
 
     def row_loss(

@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.functional import temper
 from torchrl_bmrl.generators import ActionKeys, LatentGenerator
 from torchrl_bmrl.modules.generator import BoundedModule, make_mlp, sized
 
@@ -28,10 +27,8 @@ class _MixtureDecoder(BoundedModule):
         bounds: tuple[float | Tensor, float | Tensor],
         num_components: int,
         min_scale: float,
-        tempered: bool,
     ) -> None:
         super().__init__(bounds)
-        self.tempered = tempered
         self.action_dim, self.num_components = action_dim, num_components
         self.min_scale = min_scale
         size = num_components * (2 * action_dim + 1)
@@ -52,8 +49,7 @@ class _MixtureDecoder(BoundedModule):
         chosen = (log_weight.exp().cumsum(-1) < share).sum(-1).clamp(max=self.num_components - 1)
         chosen = F.one_hot(chosen, self.num_components).to(loc).unsqueeze(-1)
         loc, scale = ((x * chosen).sum(-2) for x in (loc, scale))
-        noise = latent[..., 1:]
-        return self.scaled(loc + scale * (temper(noise) if self.tempered else noise))
+        return self.scaled(loc + scale * latent[..., 1:])
 
 
 class ActionMixture(LatentGenerator):
@@ -66,9 +62,7 @@ class ActionMixture(LatentGenerator):
     with :math:`\sigma_k \ge` ``min_scale``, since the likelihood of actions at a bound would have
     no maximum. Of a latent z, the first number chooses the component (by its share of the normal
     distribution), and the others are the deviation from its mean. The action is clamped to the
-    bounds. All candidates of a state cost one call of the network. With ``tempered``, z has one
-    number more, which decides how far the action lies from the component's mean; see
-    :func:`torchrl_bmrl.functional.temper`.
+    bounds. All candidates of a state cost one call of the network.
 
     Reference: Bishop, *Mixture Density Networks*, 1994,
     https://publications.aston.ac.uk/id/eprint/373/.
@@ -80,13 +74,12 @@ class ActionMixture(LatentGenerator):
     Keyword Args:
         num_components: Gaussians, K.
         min_scale: smallest standard deviation, in units of half the action's range.
-        tempered: whether each proposal has a random temperature.
         num_cells: widths of the hidden layers.
         bounds: lower and upper bound of the action, numbers or ``(action_dim,)``.
         observation_key: key of the observation.
 
     Reads ``observation (*B, observation_dim)``; ``decoder`` also reads ``action_latent
-    (*B, latent_dim)`` and writes ``action (*B, action_dim)``.
+    (*B, action_dim + 1)`` and writes ``action (*B, action_dim)``.
 
     Raises:
         BMRLError: for fewer than one component, or ``min_scale`` of 0.
@@ -108,7 +101,6 @@ class ActionMixture(LatentGenerator):
         *,
         num_components: int = 5,
         min_scale: float = 0.05,
-        tempered: bool = False,
         num_cells: Sequence[int] = (256, 256),
         bounds: tuple[float | Tensor, float | Tensor] = (-1.0, 1.0),
         observation_key: NestedKey = "observation",
@@ -118,11 +110,10 @@ class ActionMixture(LatentGenerator):
         if not min_scale > 0:
             raise BMRLError(f"min_scale is {min_scale}; valid: above 0")
         network = _MixtureDecoder(
-            observation_dim, action_dim, num_cells, bounds, num_components, min_scale, tempered
+            observation_dim, action_dim, num_cells, bounds, num_components, min_scale
         )
-        latent_dim = 1 + action_dim + tempered
-        reads = {observation_key: observation_dim, "action_latent": latent_dim}
-        super().__init__(sized(network, reads, {"action": action_dim}), latent_dim)
+        reads = {observation_key: observation_dim, "action_latent": action_dim + 1}
+        super().__init__(sized(network, reads, {"action": action_dim}), action_dim + 1)
         self.in_keys = [observation_key]
 
     def row_loss(

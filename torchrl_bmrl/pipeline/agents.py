@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.transforms import Transform
 
-from torchrl_bmrl.errors import CheckpointError, ConfigError, UnknownNameError
+from torchrl_bmrl.errors import CheckpointError, UnknownNameError
 from torchrl_bmrl.generators import LatentGenerator
 from torchrl_bmrl.modules import (
     ActionFlow,
@@ -56,7 +56,6 @@ def make_bcq_loss(
     generator: str = "autoencoder",
     num_qvalue_nets: int = 2,
     layer_norm: bool = False,
-    tempered: bool = False,
     perturbation: bool = False,
     **options: Any,
 ) -> BCQLoss:
@@ -69,13 +68,11 @@ def make_bcq_loss(
         generator: name of the generator, of :data:`GENERATORS`.
         num_qvalue_nets: number of critics.
         layer_norm: whether the critics' hidden layers are normalised.
-        tempered: whether each proposal has a random temperature; not with an autoencoder.
         perturbation: whether there is a perturbation network.
         **options: options of :class:`BCQLoss`.
 
     Raises:
         UnknownNameError: for another generator.
-        ConfigError: for an autoencoder that is ``tempered``.
         BMRLError: for options that :class:`BCQLoss` refuses.
 
     Example:
@@ -84,13 +81,10 @@ def make_bcq_loss(
     """
     if generator not in GENERATORS:
         raise UnknownNameError("generator", generator, tuple(GENERATORS))
-    if tempered and generator == "autoencoder":
-        raise ConfigError("bcq.tempered is True; valid with bcq.generator=autoencoder: False")
-    temperature = {"tempered": True} if tempered else {}
     dims = (observation_dim, action_dim)
     critic = partial(make_qvalue_network, *dims, num_cells=num_cells, layer_norm=layer_norm)
     return BCQLoss(
-        GENERATORS[generator](*dims, num_cells=num_cells, **temperature),
+        GENERATORS[generator](*dims, num_cells=num_cells),
         [critic() for _ in range(num_qvalue_nets)],
         make_perturbation_network(*dims, num_cells=num_cells) if perturbation else None,
         bounds=(-1.0, 1.0),

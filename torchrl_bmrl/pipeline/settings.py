@@ -49,6 +49,9 @@ class CollectSettings:
     def experts_of(self, task: str) -> list[ExpertSettings]:
         """Returns the experts that demonstrate a task; episode ``i`` uses ``i`` modulo the length.
 
+        Args:
+            task: name of the task.
+
         Raises:
             ConfigError: for invalid ``experts``.
         """
@@ -72,7 +75,6 @@ class BCQSettings:
     cosine: bool = False  # the learning rate decays to zero
     num_cells: list[int] = setting([256, 256], above=0)  # widths of the hidden layers
     generator: str = setting("autoencoder", choices=tuple(GENERATORS))  # model of the actions
-    tempered: bool = False  # each proposal of a flow or a mixture has a random temperature
     num_qvalue_nets: int = setting(2, above=0)  # critics of each agent
     layer_norm: bool = False  # normalises the critics' hidden layers
     num_candidates: int = setting(10, above=0)  # proposals in the critics' target
