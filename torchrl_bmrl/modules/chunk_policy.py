@@ -17,6 +17,10 @@ class ChunkPolicy(TensorDictModuleBase):
     policy writes on to the next step. A chunk also ends where ``is_init`` is true, which
     ``torchrl.envs.InitTracker`` writes: append it to environments that reset by themselves.
 
+    ``torchrl.modules.MultiStepActorWrapper`` (0.14.1) asks its policy only at resets unless it gets
+    ``n_steps``. ``torchrl.envs.MultiAction`` loses the reward of an episode that ends inside a
+    chunk, or repeats it.
+
     Args:
         policy: writes chunks: ``size`` actions one after the other in the last dimension.
         size: actions of a chunk.
