@@ -69,10 +69,14 @@ def make_rows(seed: int = 1, *, factor: float = 1.0, episodes: int = 6) -> list[
     return rows
 
 
-def make_curves(seed: int = 1, *, epochs: int = 10) -> list[CurveRow]:
+def make_curves(
+    seed: int = 1, *, epochs: int = 10, preset: str = "paper", ablation: str = "none"
+) -> list[CurveRow]:
     """Rollouts whose spread falls as one over the epoch."""
     return [
         CurveRow(
+            preset=preset,
+            ablation=ablation,
             task=task,
             seed=seed,
             epoch=epoch,

@@ -66,7 +66,7 @@ def test_the_page_of_runs_names_every_setting_that_is_free_to_change() -> None:
 
     text = (ROOT / "docs" / "runs.md").read_text()
     _, _, rest = text.partition("You may change ")
-    named = re.findall(r"`(\w+)`", rest.partition(".\n")[0])
+    named = re.findall(r"`([\w.]+)`", rest.partition(".\n")[0])
     assert sorted(named) == sorted(FREE_TO_CHANGE)
 
 

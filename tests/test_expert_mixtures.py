@@ -28,7 +28,12 @@ from torchrl_bmrl.experts.collect import collect_demonstrations
 from torchrl_bmrl.experts.controllers import ExpertGains
 from torchrl_bmrl.experts.settings import experts_of
 from torchrl_bmrl.pipeline import CollectSettings, Run, Settings
-from torchrl_bmrl.pipeline.evaluate import expert_outcomes
+from torchrl_bmrl.pipeline.evaluate import (
+    evaluate,
+    evaluate_job,
+    expert_outcomes,
+    reference_outcomes,
+)
 from torchrl_bmrl.run.workers import derive_seed
 from torchrl_bmrl.studies import imitation
 from torchrl_bmrl.tasks import Task, register_task
@@ -180,6 +185,75 @@ def test_the_experts_rows_play_the_mixture(tmp_path: Path) -> None:
     assert [each.success for each in outcomes] == [True, True, False, True]
 
 
+def test_the_reference_is_the_scripted_expert_without_noise_and_with_default_gains(
+    tmp_path: Path,
+) -> None:
+    chosen = settings(tmp_path, default=MIXTURE)
+    chosen.collect.gains = ExpertGains(speed_limit=0.1)
+    outcomes = reference_outcomes(Run(chosen), "waving", [7, 8])
+    assert [each.episode_return for each in outcomes] == [pytest.approx(0.0 + 1.0 + 0.7)] * 2
+
+
+def test_the_reference_is_played_once_on_the_starts_of_the_evaluation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeds: list[int] = []
+
+    def counting(seed: int, **options: Any) -> Any:
+        seeds.append(seed)
+        return record(seed, **options)
+
+    register_task(replace(TASKS[0], record=counting, horizon=3))
+    chosen = settings(tmp_path, default=MIXTURE)
+    chosen.evaluate.episodes = 4
+    started = Run(chosen)
+    steps: list[int] = []
+    rows = evaluate_job((started, ("waving", "reference", "")), steps.append)
+    assert seeds == [started.seed("evaluate", "waving", i) for i in range(4)]
+    assert evaluate_job((started, ("waving", "reference", "")), steps.append) == rows
+    assert len(seeds) == 4
+    assert steps == [12, 12]
+    assert {row.policy for row in rows} == {"reference"}
+    expert = evaluate_job((started, ("waving", "expert", "")), steps.append)
+    assert expert[0].episode_return != rows[0].episode_return
+
+
+@pytest.mark.parametrize("reference", [True, False])
+def test_only_scripted_experts_have_a_reference_and_only_if_the_setting_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reference: bool
+) -> None:
+    played: list[tuple[str, ...]] = []
+
+    class StopError(Exception): ...
+
+    def jobs(self: Run, function: Any, jobs: Any, **options: Any) -> Any:
+        played.extend(jobs)
+        raise StopError
+
+    monkeypatch.setattr(Run, "jobs", jobs)
+    monkeypatch.setattr(Run, "horizon", lambda *_: 3)
+    monkeypatch.setattr(Run, "playable", True)
+    chosen = settings(tmp_path)
+    chosen.tasks = {"waving": {"task": "waving"}, "door": {"demonstrations": "door.hdf5"}}
+    chosen.evaluate.reference = reference
+    with Run(chosen) as started, pytest.raises(StopError):
+        evaluate(started)
+    found = [job for job in played if job[1] == "reference"]
+    assert found == [("waving", "reference", "")] * reference
+    assert ("door", "expert", "") in played
+
+
+def test_the_reference_may_join_a_finished_run(tmp_path: Path) -> None:
+    with Run(settings(tmp_path)):
+        pass
+    config = tmp_path / "config.yaml"
+    config.write_text(config.read_text().replace("  reference: false\n", ""))
+    chosen = settings(tmp_path)
+    chosen.evaluate.reference = True
+    with Run(chosen):
+        pass
+
+
 def test_the_demonstrations_to_imitate_use_the_experts_in_turn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -281,6 +355,7 @@ def test_weak_presets_have_the_speed_limits_and_the_noise_that_the_docs_explain(
         collect = Run(chosen).settings.collect
         assert list(collect.train_episodes.values()) == numbers
         assert chosen.evaluate.expert_rollouts
+        assert chosen.evaluate.reference
         (reach,), (lift,) = collect.experts_of("reach"), collect.experts_of("lift")
         assert (reach.noise, reach.gains.speed_limit) == (0.4, 0.03)
         assert (lift.noise, lift.gains.speed_limit) == (0.4, 0.35)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import json
 import shlex
+import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -31,6 +32,7 @@ from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
 from torchrl_bmrl.evaluation import ResultRow, write_results
 from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.training.checkpoint import save_checkpoint
+from torchrl_bmrl.training.diagnostics import Diagnostics, write_diagnostics
 
 
 @pytest.fixture
@@ -173,6 +175,76 @@ def test_a_damaged_folder_leaves_what_was_published(
     with pytest.raises(BMRLError, match=name):
         publish.publish([bad], docs)
     assert {p: p.read_bytes() for p in docs.rglob("*") if p.is_file()} == before
+
+
+def stage_1_folder(path: Path, *overrides: str) -> Path:
+    """A run of stage 1 alone, of two epochs."""
+    run_dir = make_folder(path, *overrides, "bcq.epochs=2")
+    (run_dir / "results.csv").unlink()
+    shutil.rmtree(run_dir / "distill")
+    found = {"qvalue_gap": 1.0, "qvalue_std": 2.0, "outside_share": 0.1, "latent_kl": None}
+    for task in TASKS:
+        curve = [
+            {"epoch": epoch, "update": epoch, "episode": 0, "return": 10.0 * epoch, "success": 1}
+            for epoch in (1, 2)
+        ]
+        write_rows(run_dir / "bcq" / task / "evaluations.csv", curve)
+        for epoch in (1, 2):
+            numbers = Diagnostics(candidate_spread=0.1, spread_ratio=epoch / 3, **found)  # type: ignore[arg-type]
+            path = run_dir / "bcq" / task / "diagnostics.csv"
+            write_diagnostics(path, numbers, epoch=epoch, update=epoch)
+    return run_dir
+
+
+def test_weak_runs_have_a_folder_and_a_page_of_their_own(publish: Any, tmp_path: Path) -> None:
+    docs = tmp_path / "docs"
+    (page,) = publish.publish([make_folder(tmp_path / "a", "preset=quick")], docs)
+    before = {p: p.read_bytes() for p in docs.rglob("*") if p.is_file()}
+    runs = [
+        make_folder(tmp_path / "main", "preset=weak_paper"),
+        stage_1_folder(tmp_path / "change", "preset=weak", "ablation=dim4"),
+    ]
+    assert publish.publish(runs, docs) == [page, docs / "weak.md"]
+    for path, content in before.items():
+        assert path.read_bytes() == content
+    published = read_published(docs / "results" / "weak")
+    main, change = published.runs
+    assert main.key == ("weak_paper", "none", 3)
+    assert change.key == ("weak", "dim4", 3)
+    assert change.command == (
+        "python recipes/train_bcq.py preset=weak ablation=dim4 seed=3 bcq.epochs=2"
+    )
+    assert (change.accuracy, change.task_latent_dim) == (None, 4)
+    assert {e.key for e in published.episodes} == {main.key}
+    curves = [c for c in published.curves if c.key == change.key]
+    assert [(c.task, c.epoch, c.episode_return) for c in curves] == [(t, 2, 20.0) for t in TASKS]
+    assert [(d.task, d.update, d.spread_ratio, d.relative_gap) for d in published.diagnostics] == [
+        (task, 2, 0.6667, 0.5) for task in TASKS
+    ]
+    publish.check_weak_page(docs)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "epochs", "says"),
+    [
+        (["preset=weak_paper"], 2, "checkpoint.safetensors"),
+        (["preset=quick", "ablation=dim4"], 2, "checkpoint.safetensors"),
+        (["preset=weak", "ablation=dim4"], 1, r"push_up.evaluations\.csv.*the last is 1; valid: 2"),
+        (["preset=weak", "ablation=dim4"], 0, r"push_up.evaluations\.csv"),
+    ],
+)
+def test_only_finished_changes_of_weak_runs_may_have_stage_1_alone(
+    publish: Any, tmp_path: Path, overrides: list[str], epochs: int, says: str
+) -> None:
+    run_dir = stage_1_folder(tmp_path / "run", *overrides)
+    path = run_dir / "bcq" / "push_up" / "evaluations.csv"
+    if epochs:
+        path.write_text("".join(path.read_text().splitlines(keepends=True)[: epochs + 1]))
+    else:
+        path.unlink()
+    with pytest.raises(BMRLError, match=says):
+        publish.publish([run_dir], tmp_path / "docs")
+    assert not (tmp_path / "docs").exists()
 
 
 def test_episodes_of_another_seed_are_refused(publish: Any, tmp_path: Path) -> None:

@@ -127,7 +127,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 def test_rollouts_of_a_run_get_its_task_and_seed(tmp_path: Path) -> None:
     path = tmp_path / "evaluations.csv"
     path.write_text("epoch,update,episode,return,success\n1,10,0,2.5,1\n1,10,1,1.5,0\n")
-    rows = read_curve_rows(path, task="lift", seed=4)
+    rows = read_curve_rows(path, run=("paper", "none", 4), task="lift")
     assert [(r.task, r.seed, r.episode_return, r.success) for r in rows] == [
         ("lift", 4, 2.5, True),
         ("lift", 4, 1.5, False),

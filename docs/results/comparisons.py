@@ -13,7 +13,6 @@ from torchrl_bmrl.evaluation.statistics import (
     probability_of_improvement,
     relative_difference,
 )
-from torchrl_bmrl.reports import paper
 from torchrl_bmrl.reports.figures import Curve
 from torchrl_bmrl.reports.tables import MISSING, Table, percent, policy_name, task_name
 
@@ -24,6 +23,7 @@ Arm = tuple[str, str]
 """A policy and its source of m, which is empty for all but the distilled policy."""
 
 EXPERT: Arm = ("expert", "")
+REFERENCE: Arm = ("reference", "")
 BCQ: Arm = ("bcq", "")
 DISTILLED: Arm = ("distilled", DEFAULT_SOURCE)
 
@@ -42,7 +42,7 @@ def difference(
     ``y`` are taken. The result is ``None`` if the policies share no episode on one of the tasks, or
     if the mean return of ``y`` is not positive on one.
     """
-    one, other = _returns(ours, x, tasks), _returns(theirs, y, tasks)
+    one, other = returns_of(ours, x, tasks), returns_of(theirs, y, tasks)
     shared = sorted(one.keys() & other.keys())
     if not shared or {task for task, _, _ in shared} != set(tasks):
         return None
@@ -70,7 +70,7 @@ def improvement(
 ) -> Estimate | None:
     """Probability of improvement, mean over tasks; ``None`` if tasks or seeds of the two differ."""
     rows = list(rows)
-    values = [_returns(rows, arm, tasks) for arm in (x, y)]
+    values = [returns_of(rows, arm, tasks) for arm in (x, y)]
     strata = [[f"{task}/{seed}" for task, seed, _ in value] for value in values]
     if set(strata[0]) != set(strata[1]) or {task for task, _, _ in values[0]} != set(tasks):
         return None
@@ -79,50 +79,6 @@ def improvement(
         list(values[1].values()),
         x_strata=strata[0],
         y_strata=strata[1],
-    )
-
-
-def targets_table(
-    rows: Sequence[ResultRow], summaries: Sequence[Summary], runs: Sequence[RunRow]
-) -> Table:
-    """Compares both stages with their targets; numbers not measured on every task are left out."""
-    lines = []
-
-    def add(what: str, least: float, value: float, measured: str) -> None:
-        met = "yes" if value >= least else "no"
-        lines.append((what, f"at least {least:.0%}", measured, met))
-
-    def add_success(name: str, arm: Arm) -> None:
-        mine = [s for s in summaries if (s.policy, s.latent_source) == arm]
-        rates = [(s.success_rate, s.task, s.success_interval) for s in mine]
-        if len(rates) < len(TASKS):
-            return
-        rate, task, (low, high) = min(rates, key=lambda row: (row[0], TASKS.index(row[1])))
-        where = f"{task_name(task)}: [{low:.1%}, {high:.1%}]"
-        add(f"{name}: success", 0.95, rate, f"{rate:.1%} ({where})")
-
-    if len(gains := differences(rows, BCQ, EXPERT)) == len(TASKS):
-        task, gain = min(gains.items(), key=lambda item: item[1].low)
-        what = "BCQ over the expert: lower end of the interval of the relative difference"
-        add(what, -0.02, gain.low, f"{gain.low:+.1%} ({task_name(task)}: {_signed(gain)})")
-    add_success("BCQ", BCQ)
-    if len(gains := differences(rows, DISTILLED, BCQ)) == len(TASKS):
-        task, gain = min(gains.items(), key=lambda item: item[1].value)
-        value, where = 1 + gain.value, f"{task_name(task)}: {_share(gain)}"
-        add("Distilled: return as a share of BCQ's", 0.98, value, f"{value:.1%} ({where})")
-    add_success("Distilled", DISTILLED)
-    if accuracies := [(run.accuracy, run.seed) for run in runs if run.accuracy is not None]:
-        accuracy, seed = min(accuracies)
-        what = "Accuracy of the task classifier on held-out transitions"
-        add(what, paper.ACCURACY, accuracy, f"{accuracy:.1%} (seed {seed})")
-    return Table(
-        title="What was asked for",
-        caption=(
-            "Each number is that of the task, or of the seed, that fares worst; the interval "
-            f"beside it is that task's. Distilled: with the default source of m, {DEFAULT_SOURCE}."
-        ),
-        header=("What", "Asked", "Measured", "Met"),
-        rows=lines,
     )
 
 
@@ -135,7 +91,7 @@ def seeds_table(rows: Sequence[ResultRow], runs: Sequence[RunRow]) -> Table:
         lines.append(
             (
                 str(run.seed),
-                *(MISSING if gain is None else _share(gain) for gain in gains),
+                *(MISSING if gain is None else share(gain) for gain in gains),
                 *(_success_rate(mine, arm, TASKS) for arm in (BCQ, DISTILLED)),
                 MISSING if run.accuracy is None else f"{run.accuracy:.1%}",
             )
@@ -168,7 +124,7 @@ def differences_table(rows: Sequence[ResultRow], arms: Sequence[Arm]) -> Table:
             chance = improvement(rows, arm, EXPERT, tasks)
             if gain is not None:
                 name = task_name(tasks[0]) if len(tasks) == 1 else "Mean over tasks"
-                lines.append((policy_name(arm[0]), name, _signed(gain), _probability(chance)))
+                lines.append((policy_name(arm[0]), name, signed(gain), _probability(chance)))
     return Table(
         title="Difference to the expert, and probability of improvement",
         caption=(
@@ -206,11 +162,11 @@ def policies_table(
         for task in TASKS:
             gain = difference(rows, rows, arm, reference, [task])
             rate = success.get((task, *arm))
-            share = MISSING if gain is None else f"{1 + gain.value:.1%}"
-            cells.append(MISSING if rate is None else f"{share} ({rate:.0%})")
+            cell = MISSING if gain is None else f"{1 + gain.value:.1%}"
+            cells.append(MISSING if rate is None else f"{cell} ({rate:.0%})")
         mean = difference(rows, rows, arm, reference)
         seeds = sorted({row.seed for row in rows if (row.policy, row.latent_source) == arm})
-        mean_share = MISSING if mean is None else _share(mean)
+        mean_share = MISSING if mean is None else share(mean)
         lines.append((name, *cells, mean_share, ", ".join(map(str, seeds))))
     return Table(
         title=title,
@@ -234,7 +190,7 @@ def gains_table(rows: Sequence[ResultRow], pairs: Sequence[tuple[Arm, Arm]]) -> 
             chance = improvement(rows, x, y)
             ends = [f"{d.value:+.1%} ({task_name(task)})" for task, d in (each[0], each[-1])]
             name = f"{policy_name(x[0])} over {policy_name(y[0])}"
-            lines.append((name, _signed(mean), *ends, _probability(chance)))
+            lines.append((name, signed(mean), *ends, _probability(chance)))
     return Table(
         title="What the two stages buy",
         caption=(
@@ -302,9 +258,9 @@ def ablations_table(episodes: Sequence[EpisodeRow], runs: Sequence[RunRow]) -> T
             if run.key[:2] == (preset, ablation) and run.accuracy is not None
         ]
         for arm in arms_of(mine) if ablation != "none" else []:
-            if arm == EXPERT or (arm[0] == "distilled" and arm != DISTILLED):
+            if arm in (EXPERT, REFERENCE) or (arm[0] == "distilled" and arm != DISTILLED):
                 continue
-            tasks = [t for t in TASKS if _returns(mine, arm, [t])]
+            tasks = [t for t in TASKS if returns_of(mine, arm, [t])]
             gain = difference(mine, base, arm, arm, tasks)
             success = [_success_rate(mine, arm, [task]) for task in TASKS]
             accuracy = f"{np.mean(accuracies):.1%}" if accuracies else MISSING
@@ -313,7 +269,7 @@ def ablations_table(episodes: Sequence[EpisodeRow], runs: Sequence[RunRow]) -> T
                     ablation,
                     preset,
                     policy_name(arm[0]),
-                    MISSING if gain is None else _share(gain),
+                    MISSING if gain is None else share(gain),
                     *success,
                     accuracy if arm[0] == "distilled" else MISSING,
                     ", ".join(map(str, sorted(seeds))),
@@ -350,7 +306,13 @@ def arms_of(rows: Iterable[ResultRow]) -> list[Arm]:
     )
 
 
-def _returns(
+def baselines_of(rows: Iterable[ResultRow]) -> list[Arm]:
+    """Returns the policies that are neither scripted nor of the two stages."""
+    ours = ("expert", "reference", "bcq", "distilled")
+    return [arm for arm in arms_of(rows) if arm[0] not in ours]
+
+
+def returns_of(
     rows: Iterable[ResultRow], arm: Arm, tasks: Sequence[str]
 ) -> dict[tuple[str, int, int], float]:
     """Collects the returns of a policy by task, seed and number of the episode."""
@@ -366,11 +328,13 @@ def _success_rate(rows: Sequence[ResultRow], arm: Arm, tasks: Sequence[str]) -> 
     return percent(float(np.mean(hits)) if hits else None)
 
 
-def _signed(estimate: Estimate) -> str:
+def signed(estimate: Estimate) -> str:
+    """Returns a difference with its interval as tables print it."""
     return f"{estimate.value:+.1%} [{100 * estimate.low:+.1f}, {100 * estimate.high:+.1f}]"
 
 
-def _share(estimate: Estimate) -> str:
+def share(estimate: Estimate) -> str:
+    """Returns a relative difference as a share, with its interval, as tables print it."""
     low, high = 100 * (1 + estimate.low), 100 * (1 + estimate.high)
     return f"{1 + estimate.value:.1%} [{low:.1f}, {high:.1f}]"
 

@@ -1,10 +1,12 @@
-"""Adds finished runs to the CSV files of docs/results and writes docs/results.md from them.
+"""Adds finished runs to CSV files below docs/results and writes docs/results.md and docs/weak.md.
 
     python docs/results/publish.py runs/two_stage-paper-seed1 runs/two_stage-paper-seed2
-    python docs/results/publish.py            # writes the page again
-    python docs/results/publish.py --check    # exits with 1 if the page is not what the files give
+    python docs/results/publish.py            # writes the pages again
+    python docs/results/publish.py --check    # exits with 1 if a page is not what the files give
 
-A run replaces an earlier one with the same preset, ablation and seed.
+A run replaces an earlier one with the same preset, ablation and seed. Runs of the presets weak and
+weak_paper have a folder and a page of their own, docs/results/weak and docs/weak.md. Their
+ablations may be runs of recipes/train_bcq.py alone, which have no evaluation.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 import argparse
 import json
+import math
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -26,85 +29,166 @@ import torchrl_bmrl.run.as_command  # noqa: F401 -- errors at import become one 
 # isort: split
 from published import (
     TASKS,
+    WEAK,
+    WEAK_PRESETS,
     CurveRow,
+    DiagnosticsRow,
+    Key,
     RunRow,
     read_curve_rows,
     read_published,
     write_published,
 )
 from results_page import check_results_page, write_results_page
+from weak_page import check_weak_page, write_weak_page
 
 from torchrl_bmrl.errors import ConfigError, DataError
-from torchrl_bmrl.evaluation import read_results
+from torchrl_bmrl.evaluation import ResultRow, read_results
 from torchrl_bmrl.files import read_json
 from torchrl_bmrl.run.command_line import exit_codes
 from torchrl_bmrl.run.folder import deciding, read_settings, read_versions
 from torchrl_bmrl.training.checkpoint import load_checkpoint
+from torchrl_bmrl.training.diagnostics import read_diagnostics
 
 DOCS = Path(__file__).resolve().parents[1]
 RECIPES = DOCS.parent / "recipes"
 STAGES = ("collect", "stage 1", "stage 2", "evaluate")
 
 
-def publish(runs: Sequence[Path], docs: Path = DOCS) -> Path:
-    """Adds the runs to the CSV files and writes the page.
+def publish(runs: Sequence[Path], docs: Path = DOCS) -> list[Path]:
+    """Adds the runs to the CSV files and writes the pages.
 
     Returns:
-        path of the page.
+        paths of the pages.
 
     Raises:
         BMRLError: if a file of a run is missing or not valid; nothing is written then.
     """
-    published = read_published(docs / "results")
+    folders = [docs / "results", docs / "results" / "weak"]
+    published = [read_published(folder) for folder in folders]
     for run_dir in runs:
         run = read_run(run_dir)
-        rows = read_results(run_dir / "results.csv")
-        if (path := run_dir / "baselines.csv").exists():
-            rows += read_results(path)
-        for row in rows:
-            if row.seed != run.seed:
-                message = f"{row.seed}; the run's is {run.seed}"
-                raise DataError(run_dir / "results.csv", "seed", message)
-        published = published.with_run(run, rows, read_curves(run_dir, run.seed))
-    write_published(docs / "results", published)
-    return write_results_page(docs)
+        weak = run.preset in WEAK_PRESETS
+        published[weak] = published[weak].with_run(
+            run,
+            read_episodes(run_dir, run),
+            read_curves(run_dir, run.key),
+            read_agents(run_dir, run.key) if weak else [],
+        )
+    for folder, content in zip(folders, published, strict=True):
+        write_published(folder, content)
+    pages = [write_results_page(docs), write_weak_page(docs)]
+    return [page for page in pages if page is not None]
 
 
 def read_run(run_dir: Path) -> RunRow:
-    """Reads a run's settings, versions, times and accuracy from its folder."""
+    """Reads a run's settings, versions, times and accuracy from its folder.
+
+    Raises:
+        BMRLError: if a file is missing or not valid, or stage 1 has not ended in a run without a
+            distilled policy.
+    """
     settings, versions = read_settings(run_dir), read_versions(run_dir)
-    command = command_of(settings)
     path = run_dir / "seconds.json"
     seconds = read_json(path, "the seconds of a run") if path.exists() else {}
-    student = run_dir / "distill" / "checkpoint.safetensors"
-    _, metadata = load_checkpoint(student, kind="student")
+    if alone := is_stage_1_alone(run_dir, settings):
+        check_stage_1(run_dir, settings)
+        accuracy, task_latent_dim = None, settings["distill"]["task_latent_dim"]
+    else:
+        student = run_dir / "distill" / "checkpoint.safetensors"
+        _, metadata = load_checkpoint(student, kind="student")
+        accuracy = round(metadata["accuracy"], 5)
+        task_latent_dim = metadata["student"]["task_latent_dim"]
     return RunRow(
         preset=settings["preset"],
         ablation=settings["ablation"],
         seed=settings["seed"],
-        command=command,
+        command=command_of(settings, "train_bcq.py" if alone else "two_stage.py"),
         commit=versions.pop("commit", None) or "",
         versions=", ".join(f"{name} {version}" for name, version in versions.items()),
-        accuracy=round(metadata["accuracy"], 5),
-        task_latent_dim=metadata["student"]["task_latent_dim"],
+        accuracy=accuracy,
+        task_latent_dim=task_latent_dim,
         **{f"seconds_{name.replace(' ', '_')}": seconds.get(name) for name in STAGES},
         device=settings["device"],
         workers=settings["workers"],
     )
 
 
-def read_curves(run_dir: Path, seed: int) -> list[CurveRow]:
+def is_stage_1_alone(run_dir: Path, settings: Mapping[str, Any]) -> bool:
+    """Whether a run of stage 1 alone may be published: not a main run, and nothing follows it."""
+    names = settings.get("preset"), settings.get("ablation")
+    later = [run_dir / "distill", run_dir / "results.csv"]
+    return names[0] in WEAK_PRESETS and names != WEAK and not any(map(Path.exists, later))
+
+
+def check_stage_1(run_dir: Path, settings: Mapping[str, Any]) -> None:
+    """Checks that the agents of all tasks were rolled out after the last epoch.
+
+    Raises:
+        DataError: naming the first file that is missing or too short.
+    """
+    key = settings["preset"], settings["ablation"], settings["seed"]
+    last = settings["bcq"]["epochs"]
+    for task in TASKS:
+        path = run_dir / "bcq" / task / "evaluations.csv"
+        epoch = max((row.epoch for row in read_curve_rows(path, run=key, task=task)), default=0)
+        if epoch != last:
+            raise DataError(path, "epoch", f"the last is {epoch}; valid: {last}, as bcq.epochs")
+
+
+def read_episodes(run_dir: Path, run: RunRow) -> list[ResultRow]:
+    """Reads the evaluated episodes of a run; a run of stage 1 alone has none.
+
+    Raises:
+        BMRLError: if a file is missing or not valid, or an episode has another seed than the run.
+    """
+    if not run.evaluated:
+        return []
+    rows = read_results(run_dir / "results.csv")
+    if (path := run_dir / "baselines.csv").exists():
+        rows += read_results(path)
+    for row in rows:
+        if row.seed != run.seed:
+            message = f"{row.seed}; the run's is {run.seed}"
+            raise DataError(run_dir / "results.csv", "seed", message)
+    return rows
+
+
+def read_curves(run_dir: Path, run: Key) -> list[CurveRow]:
     """Reads the rollouts after each epoch of stage 1, for those tasks that have them."""
     files = {task: run_dir / "bcq" / task / "evaluations.csv" for task in TASKS}
     return [
         row
         for task, path in files.items()
         if path.is_file()
-        for row in read_curve_rows(path, task=task, seed=seed)
+        for row in read_curve_rows(path, run=run, task=task)
     ]
 
 
-def command_of(settings: Mapping[str, Any]) -> str:
+def read_agents(run_dir: Path, run: Key) -> list[DiagnosticsRow]:
+    """Reads the last diagnostics of each task's agent, for those tasks that have them."""
+    preset, ablation, seed = run
+    found = []
+    for task in TASKS:
+        path = run_dir / "bcq" / task / "diagnostics.csv"
+        if path.is_file() and (rows := read_diagnostics(path)):
+            last = rows[update := max(rows)]
+            gap = last.relative_gap
+            row = DiagnosticsRow(
+                preset=preset,
+                ablation=ablation,
+                task=task,
+                seed=seed,
+                update=update,
+                spread_ratio=round(last.spread_ratio, 4),
+                relative_gap=round(gap, 4) if math.isfinite(gap) else None,
+                outside_share=round(last.outside_share, 4),
+            )
+            found.append(row)
+    return found
+
+
+def command_of(settings: Mapping[str, Any], recipe: str = "two_stage.py") -> str:
     """Returns the command that gives the settings of a run's ``config.yaml``.
 
     Settings that differ from the run's preset and ablation become overrides. Settings that did not
@@ -134,23 +218,24 @@ def command_of(settings: Mapping[str, Any]) -> str:
     seed = differing.pop("seed", 0)
     words = [choice for choice in choices if choice != "ablation=none"]
     words += [f"seed={seed}", *(f"{key}={json.dumps(value)}" for key, value in differing.items())]
-    return shlex.join(["python", "recipes/two_stage.py", *words])
+    return shlex.join(["python", f"recipes/{recipe}", *words])
 
 
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("runs", nargs="*", type=Path, help="folders of finished runs")
-    parser.add_argument("--check", action="store_true", help="check the page, write nothing")
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the page")
+    parser.add_argument("--check", action="store_true", help="check the pages, write nothing")
+    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the pages")
     options = parser.parse_args()
     if options.check and options.runs:
         parser.error("--check takes no runs")
     with exit_codes():
         if options.check:
             check_results_page(options.docs)
+            check_weak_page(options.docs)
         else:
-            print(publish(options.runs, options.docs))
+            print(*publish(options.runs, options.docs), sep="\n")
 
 
 if __name__ == "__main__":

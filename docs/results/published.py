@@ -1,7 +1,9 @@
-"""The published results: three CSV files from which the results page is computed.
+"""The published results: CSV files from which the pages are computed.
 
-``episodes.csv`` has every evaluated episode, ``curves.csv`` the rollouts after every epoch of stage
-1, ``runs.csv`` the runs. Their order is fixed, so that equal results give equal files.
+``episodes.csv`` contains every evaluated episode, ``curves.csv`` rollouts after the epochs of stage
+1, ``diagnostics.csv`` the last diagnostics of the agents, and ``runs.csv`` the runs. The order of
+the rows is fixed, so equal results give equal files. Runs on weak demonstrations have files of
+their own.
 """
 
 from __future__ import annotations
@@ -25,7 +27,11 @@ from torchrl_bmrl.reports.paper import TABLE_1
 TASKS = tuple(TABLE_1)
 """The paper's six tasks, in the order of its tables."""
 MAIN = ("paper", "none")
-"""Preset and ablation of the runs that are compared with the paper; only their curves are kept."""
+"""Preset and ablation of the runs that are compared with the paper; all their curves are kept."""
+WEAK = ("weak_paper", "none")
+"""Preset and ablation of the main runs on weak demonstrations."""
+WEAK_PRESETS = (WEAK[0], "weak")
+"""Presets on the page of weak demonstrations; the curves of their last epoch are kept."""
 
 Key = tuple[str, str, int]
 """Preset, ablation and seed, which identify a run."""
@@ -33,7 +39,7 @@ Key = tuple[str, str, int]
 
 @dataclass(frozen=True, kw_only=True)
 class RunRow:
-    """A finished run; a time [s] is ``None`` if it was not measured."""
+    """A finished run; a time [s] is ``None`` if it was not measured, or its stage was not run."""
 
     preset: str
     ablation: str
@@ -41,7 +47,7 @@ class RunRow:
     command: str  # runs it again
     commit: str  # of the code; empty if unknown
     versions: str
-    accuracy: float | None  # held-out accuracy of the task classifier, in [0, 1]
+    accuracy: float | None  # of the task classifier, held out, in [0, 1]; None: stage 1 alone
     task_latent_dim: int
     seconds_collect: float | None
     seconds_stage_1: float | None
@@ -54,6 +60,11 @@ class RunRow:
     def key(self) -> Key:
         """Preset, ablation and seed."""
         return self.preset, self.ablation, self.seed
+
+    @property
+    def evaluated(self) -> bool:
+        """Whether the run has a distilled policy and an evaluation, not stage 1 alone."""
+        return self.accuracy is not None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,8 +83,10 @@ class EpisodeRow:
 
 @dataclass(frozen=True, kw_only=True)
 class CurveRow:
-    """A rollout of a BCQ policy after an epoch of its training, in a run of :data:`MAIN`."""
+    """A rollout of a BCQ policy after an epoch of its training."""
 
+    preset: str
+    ablation: str
     task: str
     seed: int
     epoch: int
@@ -82,67 +95,114 @@ class CurveRow:
     episode_return: float
     success: bool
 
+    @property
+    def key(self) -> Key:
+        """Preset, ablation and seed of the run."""
+        return self.preset, self.ablation, self.seed
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiagnosticsRow:
+    """The last diagnostics of a task's agent; the gap is ``None`` if it is not defined."""
+
+    preset: str
+    ablation: str
+    task: str
+    seed: int
+    update: int
+    spread_ratio: float
+    relative_gap: float | None
+    outside_share: float
+
+    @property
+    def key(self) -> Key:
+        """Preset, ablation and seed of the run."""
+        return self.preset, self.ablation, self.seed
+
 
 @dataclass(frozen=True, kw_only=True)
 class Published:
-    """The content of the three files."""
+    """The content of the files of a folder."""
 
     episodes: Sequence[EpisodeRow] = ()
     curves: Sequence[CurveRow] = ()
+    diagnostics: Sequence[DiagnosticsRow] = ()
     runs: Sequence[RunRow] = ()
 
     def with_run(
-        self, run: RunRow, rows: Iterable[ResultRow], curves: Iterable[CurveRow]
+        self,
+        run: RunRow,
+        rows: Iterable[ResultRow],
+        curves: Iterable[CurveRow],
+        diagnostics: Iterable[DiagnosticsRow] = (),
     ) -> Published:
         """Adds a run; it replaces an earlier one with the same preset, ablation and seed."""
         episodes = [e for e in self.episodes if e.key != run.key]
         episodes += [EpisodeRow(preset=run.preset, ablation=run.ablation, row=row) for row in rows]
-        kept = list(self.curves)
-        if (run.preset, run.ablation) == MAIN:
-            kept = [c for c in kept if c.seed != run.seed] + list(curves)
-        runs = [r for r in self.runs if r.key != run.key] + [run]
-        return Published(episodes=episodes, curves=kept, runs=runs)
+        return Published(
+            episodes=episodes,
+            curves=[c for c in self.curves if c.key != run.key] + _kept_curves(run, curves),
+            diagnostics=[d for d in self.diagnostics if d.key != run.key] + list(diagnostics),
+            runs=[r for r in self.runs if r.key != run.key] + [run],
+        )
 
 
-def read_curve_rows(path: Path, *, task: str, seed: int) -> list[CurveRow]:
+def read_curve_rows(path: Path, *, run: Key, task: str) -> list[CurveRow]:
     """Reads the rollouts of one task's stage 1 from its ``evaluations.csv``."""
-    columns = {column: parse for column, parse in _CURVES.items() if column not in ("task", "seed")}
-    rows = read_rows(path, columns)
-    return [_curve_row({"task": task, "seed": seed, **row}) for row in rows]
+    preset, ablation, seed = run
+    known = {"preset": preset, "ablation": ablation, "task": task, "seed": seed}
+    columns = {column: parse for column, parse in _CURVES.items() if column not in known}
+    return [_curve_row({**known, **row}) for row in read_rows(path, columns)]
+
+
+def _kept_curves(run: RunRow, curves: Iterable[CurveRow]) -> list[CurveRow]:
+    """Returns the rollouts that are published: all, those of the last epoch, or none."""
+    rows = list(curves)
+    if run.key[:2] == MAIN:
+        return rows
+    if run.preset not in WEAK_PRESETS:
+        return []
+    last: dict[str, int] = {}
+    for row in rows:
+        last[row.task] = max(row.epoch, last.get(row.task, 0))
+    return [row for row in rows if row.epoch == last[row.task]]
 
 
 def read_published(folder: Path) -> Published:
-    """Reads the three files of a folder; without ``runs.csv`` the result is empty.
+    """Reads the files of a folder; without ``runs.csv`` the result is empty.
 
     Raises:
-        DataError: if a file is missing, a value is not valid, a row occurs twice, or an episode or
-            a curve belongs to a run that is not in ``runs.csv``.
+        DataError: if ``episodes.csv`` is missing beside a run with an evaluation, a value is not
+            valid, a row occurs twice, or a row belongs to a run that is not in ``runs.csv``.
     """
-    files = [folder / f"{file}.csv" for file in ("episodes", "curves", "runs")]
-    if not files[2].is_file():
-        return Published(episodes=[], curves=[], runs=[])
+    files = [folder / f"{file}.csv" for file in ("episodes", "curves", "diagnostics", "runs")]
+    if not files[3].is_file():
+        return Published(episodes=[], curves=[], diagnostics=[], runs=[])
+    runs = [RunRow(**row) for row in read_rows(files[3], _RUNS)]
     columns = {"preset": name, "ablation": name, **RESULT_COLUMNS, "task": one_of(*TASKS)}
+    evaluated = any(run.evaluated for run in runs)
     episodes = [
         EpisodeRow(
             preset=values["preset"],
             ablation=values["ablation"],
             row=result_row(values, files[0], line),
         )
-        for line, values in enumerate(read_rows(files[0], columns), start=2)
+        for line, values in enumerate(_optional_rows(files[0], columns, evaluated), start=2)
     ]
-    # Without runs of MAIN there is no file of curves.
-    curves = [_curve_row(r) for r in read_rows(files[1], _CURVES)] if files[1].is_file() else []
-    runs = [RunRow(**row) for row in read_rows(files[2], _RUNS)]
+    curves = [_curve_row(r) for r in _optional_rows(files[1], _CURVES)]
+    diagnostics = [DiagnosticsRow(**r) for r in _optional_rows(files[2], _DIAGNOSTICS)]
     _check_unique(files[0], [_episode_order(e) for e in episodes])
     _check_unique(files[1], [_curve_order(c) for c in curves])
-    _check_unique(files[2], [run.key for run in runs])
+    _check_unique(files[2], [_agent_order(d) for d in diagnostics])
+    _check_unique(files[3], [run.key for run in runs])
     for path, keys in (
         (files[0], {e.key for e in episodes}),
-        (files[1], {(*MAIN, c.seed) for c in curves}),
+        (files[1], {c.key for c in curves}),
+        (files[2], {d.key for d in diagnostics}),
     ):
         for key in sorted(keys - {run.key for run in runs}):
             raise DataError(path, None, f"run {key} (preset, ablation, seed) is not in runs.csv")
-    return Published(episodes=episodes, curves=curves, runs=runs)
+    return Published(episodes=episodes, curves=curves, diagnostics=diagnostics, runs=runs)
 
 
 def write_published(folder: Path, published: Published) -> None:
@@ -166,6 +226,8 @@ def write_published(folder: Path, published: Published) -> None:
     ]
     curves = [
         {
+            "preset": c.preset,
+            "ablation": c.ablation,
             "task": c.task,
             "seed": c.seed,
             "epoch": c.epoch,
@@ -176,11 +238,14 @@ def write_published(folder: Path, published: Published) -> None:
         }
         for c in sorted(published.curves, key=_curve_order)
     ]
-    runs = [
-        {column: "" if value is None else value for column, value in vars(run).items()}
-        for run in sorted(published.runs, key=lambda run: _run_order(run.key))
-    ]
-    for file, rows in {"episodes": episodes, "curves": curves, "runs": runs}.items():
+    diagnostics = [_record(d) for d in sorted(published.diagnostics, key=_agent_order)]
+    runs = [_record(run) for run in sorted(published.runs, key=lambda run: _run_order(run.key))]
+    for file, rows in {
+        "episodes": episodes,
+        "curves": curves,
+        "diagnostics": diagnostics,
+        "runs": runs,
+    }.items():
         if rows:
             write_rows(folder / f"{file}.csv", rows)
 
@@ -190,9 +255,13 @@ def _curve_row(values: Mapping[str, Any]) -> CurveRow:
     return CurveRow(episode_return=values.pop("return"), **values)
 
 
+def _record(row: RunRow | DiagnosticsRow) -> dict[str, Any]:
+    return {column: "" if value is None else value for column, value in vars(row).items()}
+
+
 def _run_order(key: Key) -> tuple[Any, ...]:
-    """Sorts the preset of MAIN first, and runs without an ablation before those with one."""
-    return key[0] != MAIN[0], key[0], key[1] != MAIN[1], *key[1:]
+    """Sorts the presets of the main runs first, and runs without an ablation before the others."""
+    return key[0] not in (MAIN[0], WEAK[0]), key[0], key[1] != "none", *key[1:]
 
 
 def _episode_order(episode: EpisodeRow) -> tuple[Any, ...]:
@@ -202,7 +271,20 @@ def _episode_order(episode: EpisodeRow) -> tuple[Any, ...]:
 
 
 def _curve_order(row: CurveRow) -> tuple[Any, ...]:
-    return TASKS.index(row.task), row.seed, row.epoch, row.update, row.episode
+    key = row.preset, row.ablation  # the seed comes after the task
+    place = TASKS.index(row.task), row.seed, row.epoch, row.update, row.episode
+    return *_run_order((*key, 0)), *place
+
+
+def _agent_order(row: DiagnosticsRow) -> tuple[Any, ...]:
+    return *_run_order(row.key), TASKS.index(row.task)
+
+
+def _optional_rows(
+    path: Path, columns: Mapping[str, Callable[[str], Any]], required: bool = False
+) -> list[dict[str, Any]]:
+    """Reads the rows of a file; without the file there are none unless it is required."""
+    return read_rows(path, columns) if required or path.is_file() else []
 
 
 def _check_unique(path: Path, keys: Sequence[tuple[Any, ...]]) -> None:
@@ -217,6 +299,8 @@ def _optional(text: str) -> float | None:
 
 
 _CURVES: Mapping[str, Callable[[str], Any]] = {
+    "preset": name,
+    "ablation": name,
     "task": one_of(*TASKS),
     "seed": whole,
     "epoch": whole,
@@ -224,6 +308,16 @@ _CURVES: Mapping[str, Callable[[str], Any]] = {
     "episode": whole,
     "return": finite,
     "success": flag,
+}
+_DIAGNOSTICS: Mapping[str, Callable[[str], Any]] = {
+    "preset": name,
+    "ablation": name,
+    "task": one_of(*TASKS),
+    "seed": whole,
+    "update": whole,
+    "spread_ratio": finite,
+    "relative_gap": _optional,
+    "outside_share": finite,
 }
 _RUNS: Mapping[str, Callable[[str], Any]] = {
     "preset": name,

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -13,61 +11,50 @@ from comparisons import (
     DEFAULT_SOURCE,
     DISTILLED,
     EXPERT,
-    Arm,
     ablations_table,
     arms_of,
+    baselines_of,
     differences,
     differences_table,
     gains_table,
     policies_table,
     seeds_table,
     spread_table,
-    targets_table,
 )
-from published import MAIN, TASKS, CurveRow, Published, RunRow, read_published
+from pages import TITLES, Page, check_page, make_page, prose, runs_sections, write_page
+from published import (
+    MAIN,
+    TASKS,
+    CurveRow,
+    Published,
+    RunRow,
+    read_published,
+)
+from targets import targets_table
 
-from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.evaluation.results import ResultRow, Summary, summarise
-from torchrl_bmrl.files import write_atomic
-from torchrl_bmrl.reports import Picture, Section, paper, results_table, stage1_curves, task_titles
+from torchrl_bmrl.reports import Picture, Section, paper, results_table, stage1_curves
 from torchrl_bmrl.reports.figures import Curve
 from torchrl_bmrl.reports.report import headline
-from torchrl_bmrl.reports.tables import MISSING, Table, policy_name
-
-CURVES = "images/results_curves.png"
-"""The picture, below the folder of the page."""
-_TITLES = task_titles(TASKS)
-_HEAD, _RETURNS, _TRIED = (
-    (Path(__file__).parent / f"{name}.txt").read_text(encoding="utf-8")
-    for name in ("head", "returns", "tried")
-)
+from torchrl_bmrl.reports.tables import policy_name
 
 
-@dataclass(frozen=True, kw_only=True)
-class ResultsPage:
-    """The page's Markdown and its picture, which is ``None`` without training curves."""
-
-    text: str
-    curves: bytes | None
-
-
-def make_results_page(published: Published) -> ResultsPage:
+def make_results_page(published: Published) -> Page:
     """Makes the page; a section without data is left out."""
     rows = [e.row for e in published.episodes if e.key[:2] == MAIN]
     runs = [run for run in published.runs if run.key[:2] == MAIN]
+    curves = [curve for curve in published.curves if curve.key[:2] == MAIN]
     summaries = summarise(rows, TASKS)
     sections = [
-        *_main_sections(rows, summaries, runs, published.curves),
+        *_main_sections(rows, summaries, runs, curves),
         *_ablations(published),
-        *_runs(published.runs, baselines=bool(_baselines(rows))),
-        Section(heading="Why returns differ from the paper's", paragraphs=[_RETURNS.rstrip()]),
-        Section(heading="What was tried", paragraphs=[_TRIED.rstrip()]),
+        *runs_sections(published.runs, baselines=bool(baselines_of(rows))),
+        Section(heading="Why returns differ from the paper's", paragraphs=[prose("returns")]),
+        Section(heading="What was tried", paragraphs=[prose("tried")]),
     ]
     if summaries:
         sections.append(Section(heading="Everything measured", tables=[results_table(summaries)]))
-    pictures = [picture.png for section in sections for picture in section.pictures]
-    text = "\n".join([_HEAD, *map(_markdown, sections)])
-    return ResultsPage(text=text.rstrip("\n") + "\n", curves=pictures[0] if pictures else None)
+    return make_page(prose("head"), sections)
 
 
 def write_results_page(folder: Path) -> Path:
@@ -76,32 +63,16 @@ def write_results_page(folder: Path) -> Path:
     Raises:
         DataError: if a CSV file is not valid.
     """
-    page = make_results_page(read_published(folder / "results"))
-    if page.curves is not None:
-        write_atomic(folder / CURVES, page.curves)
-    write_atomic(folder / "results.md", page.text)
-    return folder / "results.md"
+    return write_page(folder / "results.md", make_results_page(read_published(folder / "results")))
 
 
 def check_results_page(folder: Path) -> None:
     """Checks that ``results.md`` is what the CSV files give, and that its picture exists.
 
-    The picture is not compared, because its bytes depend on the libraries that draw it.
-
     Raises:
         DataError: naming the first line that differs, or the picture if it is missing.
     """
-    path = folder / "results.md"
-    page = make_results_page(read_published(folder / "results"))
-    text = path.read_text(encoding="utf-8") if path.is_file() else ""
-    again = "write it with python docs/results/publish.py"
-    if text != page.text:
-        pairs = enumerate(zip_longest(text.split("\n"), page.text.split("\n")), start=1)
-        line, (here, there) = next((line, pair) for line, pair in pairs if pair[0] != pair[1])
-        message = f"line {line} is {here!r}, the CSV files give {there!r}; {again}"
-        raise DataError(path, None, message)
-    if page.curves is not None and not (folder / CURVES).is_file():
-        raise DataError(folder / CURVES, None, f"no such picture; {again}")
+    check_page(folder / "results.md", make_results_page(read_published(folder / "results")))
 
 
 def _main_sections(
@@ -136,13 +107,13 @@ def _main_sections(
             tables=[
                 paper.table_1(
                     summaries,
-                    titles=_TITLES,
+                    titles=TITLES,
                     epochs={task: curve[-1][0] for task, curve in drawn.items()},
                     differences=differences(rows, BCQ, EXPERT),
                 ),
                 paper.table_2(
                     [s for s in summaries if s.latent_source in ("", DEFAULT_SOURCE)],
-                    titles=_TITLES,
+                    titles=TITLES,
                     default_source=DEFAULT_SOURCE,
                     differences=differences(rows, DISTILLED, BCQ),
                 ),
@@ -221,13 +192,9 @@ def _figure_3(curves: dict[str, Curve], summaries: Sequence[Summary]) -> Section
     )
 
 
-def _baselines(rows: Sequence[ResultRow]) -> list[Arm]:
-    return [arm for arm in arms_of(rows) if arm[0] not in ("expert", "bcq", "distilled")]
-
-
 def _stages(rows: Sequence[ResultRow], summaries: Sequence[Summary]) -> Section:
     """Compares with other algorithms on the same demonstrations, if there are any."""
-    baselines = _baselines(rows)
+    baselines = baselines_of(rows)
     if not baselines:
         return Section(heading="")
     present = [arm for arm in (BCQ, DISTILLED) if arm in arms_of(rows)]
@@ -261,82 +228,3 @@ def _stages(rows: Sequence[ResultRow], summaries: Sequence[Summary]) -> Section:
 def _ablations(published: Published) -> list[Section]:
     table = ablations_table(published.episodes, published.runs)
     return [Section(heading="Ablations", tables=[table])] if table.rows else []
-
-
-def _runs(runs: Sequence[RunRow], *, baselines: bool) -> list[Section]:
-    """Lists the times, commands and versions of all runs."""
-    if not runs:
-        return []
-    more = " The other algorithms: the same settings with `recipes/baselines.py`, afterwards."
-    versions: dict[str, list[str]] = {}
-    for run in runs:
-        commit = f"commit {run.commit}, " if run.commit else ""
-        versions.setdefault(f"{commit}{run.versions}", []).append("/".join(map(str, run.key)))
-    return [
-        Section(heading="How long it took", tables=[_clock_table(runs)]),
-        Section(
-            heading="Again",
-            paragraphs=[
-                "The same runs, and then this page from their folders." + more * baselines,
-                "\n".join(
-                    [
-                        "```bash",
-                        *(run.command for run in runs),
-                        "python docs/results/publish.py FOLDER FOLDER",
-                        "python docs/results/publish.py --check  # whether the page is up to date",
-                        "```",
-                    ]
-                ),
-                "Versions, with the runs' preset, ablation and seed:",
-                "\n".join(f"- {text} ({', '.join(keys)})" for text, keys in versions.items()),
-            ],
-        ),
-    ]
-
-
-def _clock_table(runs: Sequence[RunRow]) -> Table:
-    """Minutes that each stage of each run took."""
-
-    def minutes(seconds: float | None) -> str:
-        return MISSING if seconds is None else f"{seconds / 60:.1f}"
-
-    return Table(
-        title="Minutes of each stage",
-        caption=(
-            "Wall-clock minutes, summed over interruptions, with what else the machine did at the "
-            "time. A run with a change may take over what it would only make again from the run "
-            "without it. Workers: processes side by side, one thread each."
-        ),
-        header=(
-            "Preset",
-            "Change",
-            "Seed",
-            "Device",
-            "Workers",
-            "Demonstrations",
-            "Stage 1",
-            "Stage 2",
-            "Evaluation",
-        ),
-        rows=[
-            (
-                run.preset,
-                run.ablation,
-                str(run.seed),
-                run.device,
-                str(run.workers),
-                minutes(run.seconds_collect),
-                minutes(run.seconds_stage_1),
-                minutes(run.seconds_stage_2),
-                minutes(run.seconds_evaluate),
-            )
-            for run in runs
-        ],
-    )
-
-
-def _markdown(section: Section) -> str:
-    pictures = [f"![{p.alt}]({CURVES})\n\n{p.caption}\n" for p in section.pictures]
-    tables = [table.markdown(level=3) for table in section.tables]
-    paragraphs = [f"{text}\n" for text in section.paragraphs]
-    return "\n".join([f"## {section.heading}\n", *paragraphs, *pictures, *tables])

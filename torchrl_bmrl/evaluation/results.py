@@ -18,6 +18,7 @@ from torchrl_bmrl.files import finite, flag, parse_row, read_rows, whole, write_
 
 POLICIES: tuple[str, ...] = (
     "expert",
+    "reference",
     "bcq",
     "distilled",
     "bc",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import cycle
 from pathlib import Path
 from statistics import fmean
@@ -19,6 +19,7 @@ from torchrl_bmrl.envs.transforms import ObservationStatistics
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
+from torchrl_bmrl.experts.settings import ExpertSettings
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.pipeline.agents import Student
 from torchrl_bmrl.pipeline.held_out import evaluate_held_out
@@ -28,6 +29,7 @@ from torchrl_bmrl.reports import Embeddings, write_report
 from torchrl_bmrl.reports.films import explore_demonstrations
 from torchrl_bmrl.run.folder import read_versions
 from torchrl_bmrl.run.workers import Report
+from torchrl_bmrl.tasks import Task
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 log = logging.getLogger(__name__)
@@ -65,6 +67,8 @@ def evaluate(run: Run) -> str:
         policies = [] if alone else [("expert", ""), ("bcq", "")]
         policies += [("distilled", source) for source in settings.latent_sources]
         jobs = [(task, *policy) for policy in policies for task in run.names]
+        if settings.reference and not alone:
+            jobs += [(task.name, "reference", "") for task in run.tasks if task.record is not None]
         rows = run.jobs(
             evaluate_job,
             jobs,
@@ -148,8 +152,9 @@ def evaluate_job(job: tuple[Run, tuple[str, str, str]], report: Report) -> list[
     task, count = run.task(name), run.settings.evaluate.num_candidates
 
     def play(seeds: list[int]) -> list[EpisodeOutcome]:
-        if policy_name == "expert":
-            outcomes = expert_outcomes(run, name, seeds)
+        if policy_name in ("expert", "reference"):
+            outcomes_of = expert_outcomes if policy_name == "expert" else reference_outcomes
+            outcomes = outcomes_of(run, name, seeds)
             report(len(seeds) * run.horizon(task))
             return outcomes
         if policy_name == "bcq":
@@ -185,15 +190,7 @@ def expert_outcomes(run: Run, name: str, seeds: list[int]) -> list[EpisodeOutcom
     """Returns the expert's outcomes: new episodes from the seeds, or its demonstrations."""
     task, collect = run.task(name), run.settings.collect
     if run.settings.evaluate.expert_rollouts and task.record is not None:
-        experts = collect.experts_of(name)
-        episodes = (
-            task.record(seed, noise=expert.noise, gains=expert.gains, **task.options)
-            for seed, expert in zip(seeds, cycle(experts), strict=False)
-        )
-        return [
-            EpisodeOutcome(float(episode.rewards.sum()), bool(episode.extras["successes"].any()))
-            for episode in episodes
-        ]
+        return _play_experts(task, collect.experts_of(name), seeds)
     data = read_demonstrations(run.demonstrations(name), task, index=run.names.index(name))
     success = data.get(("next", "success"), None)
     returns = data["next", "reward"].double()
@@ -203,6 +200,26 @@ def expert_outcomes(run: Run, name: str, seeds: list[int]) -> list[EpisodeOutcom
             float(returns[mask].sum()), None if success is None else bool(success[mask].any())
         )
         for mask in masks
+    ]
+
+
+def reference_outcomes(run: Run, name: str, seeds: Sequence[int]) -> list[EpisodeOutcome]:
+    """Plays a task's scripted expert without noise and with default gains, once per seed."""
+    return _play_experts(run.task(name), [ExpertSettings(noise=0.0)], seeds)
+
+
+def _play_experts(
+    task: Task, experts: Sequence[ExpertSettings], seeds: Sequence[int]
+) -> list[EpisodeOutcome]:
+    """Plays one episode per seed; the episodes use the experts in turn."""
+    assert task.record is not None
+    episodes = (
+        task.record(seed, noise=expert.noise, gains=expert.gains, **task.options)
+        for seed, expert in zip(seeds, cycle(experts), strict=False)
+    )
+    return [
+        EpisodeOutcome(float(episode.rewards.sum()), bool(episode.extras["successes"].any()))
+        for episode in episodes
     ]
 
 

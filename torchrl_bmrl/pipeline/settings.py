@@ -147,6 +147,7 @@ class EvaluateSettings:
     latent_sources: list[str] = setting(["prototype"], choices=LATENT_SOURCES, unique=True)
     policy: str | None = None  # an exported policy's file, evaluated alone
     expert_rollouts: bool = False  # false: the expert's rows are its demonstrations
+    reference: bool = False  # also play the scripted experts without noise, with default gains
 
 
 @dataclass

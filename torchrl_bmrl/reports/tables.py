@@ -16,6 +16,7 @@ MISSING = "–"
 
 _POLICY_NAMES = {
     "expert": "Expert",
+    "reference": "Scripted optimum",
     "bcq": "BCQ",
     "distilled": "Distilled",
     "bc": "BC",

@@ -35,6 +35,7 @@ FREE_TO_CHANGE = (
     "verbose",
     "checkpoint_interval",
     "keep_checkpoints",
+    "evaluate.reference",  # adds rows to results.csv and changes no other row
     # Sections of studies in folders of earlier versions.
     "human",
     "imitate",
@@ -128,7 +129,8 @@ def deciding(settings: Mapping[str, Any]) -> dict[str, Any]:
         >>> deciding({"seed": 0, "workers": 2, "bcq": {"lr": 0.001}})
         {'seed': 0, 'bcq.lr': 0.001}
     """
-    return dict(flat({key: x for key, x in settings.items() if key not in FREE_TO_CHANGE}))
+    named = flat({key: x for key, x in settings.items() if key not in FREE_TO_CHANGE})
+    return {key: x for key, x in named if key not in FREE_TO_CHANGE}
 
 
 def read_settings(run_dir: Path) -> dict[str, Any]:

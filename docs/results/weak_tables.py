@@ -1,0 +1,136 @@
+"""Tables of the page on weak demonstrations: returns, ablations of stage 1, diagnostics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from comparisons import BCQ, difference, share
+from published import TASKS, WEAK_PRESETS, CurveRow, DiagnosticsRow, Published
+
+from torchrl_bmrl.evaluation.results import ResultRow
+from torchrl_bmrl.reports.tables import MISSING, Table, percent, task_name
+from torchrl_bmrl.studies.baselines_report import make_table
+
+Change = tuple[str, str]
+"""Preset and ablation."""
+
+
+def returns_table(rows: Sequence[ResultRow], titles: dict[str, str]) -> Table:
+    """Mean return and success of every policy and task."""
+    return replace(
+        make_table(rows, 0, titles),
+        title="Returns and success",
+        caption=(
+            "Mean return over an episode, and success, on the same starts. Expert: the weak "
+            "expert, which acts as it demonstrates. Scripted optimum: the same controller without "
+            "noise and with default gains. Distilled: with the source of m in brackets. All "
+            "others learn from the same demonstrations; ReBRAC, BC and BCQ with a one-hot task as "
+            "in [baselines.md](baselines.md). Interval: bootstrap over the episodes of each task."
+        ),
+    )
+
+
+def steps_table(published: Published) -> Table:
+    """Stage 1 with one setting changed, beside the runs of the same preset without the change."""
+    lines, starts = [], {}
+    for preset in WEAK_PRESETS:
+        changes = list(dict.fromkeys(r.key[:2] for r in published.runs if r.preset == preset))
+        if not any(ablation != "none" for _, ablation in changes):
+            continue
+        evaluated = {change: _evaluated(published, change) for change in changes}
+        # One kind of starts for all lines of a preset, so that they can be compared.
+        if all(evaluated.values()):
+            kind, found = "those of the evaluation", evaluated
+        else:
+            kind = "those of the rollouts after each epoch of stage 1, here after the last"
+            found = {change: _rolled_out(published.curves, change) for change in changes}
+        starts[preset] = kind
+        base = found.get((preset, "none"), [])
+        lines += [_step(change, rows, base) for change, rows in found.items() if rows]
+    kinds = "; ".join(f"for preset {preset}, {kind}" for preset, kind in starts.items())
+    return Table(
+        title="One setting of stage 1 changed",
+        caption=(
+            "Each line but “none” changes one setting of the preset (`recipes/config/ablation`). "
+            "Cells: mean return of BCQ and success. Share: mean over tasks of the mean return as a "
+            "share of that without the change, on the same starts and seeds, with a 95% interval "
+            "from episodes resampled in pairs within each task and seed. Starts, which no "
+            f"demonstration had: {kinds}. Episodes: of each task and seed."
+        ),
+        header=("Change", "Preset", *map(task_name, TASKS), "Share", "Seeds", "Episodes"),
+        rows=lines,
+    )
+
+
+def agents_table(rows: Sequence[DiagnosticsRow]) -> Table:
+    """The last diagnostics of every run's agents."""
+    runs = {row.key: {r.task: r for r in rows if r.key == row.key} for row in rows}
+    return Table(
+        title="Candidates and critics",
+        caption=(
+            "After the last epoch of stage 1, on training demonstrations. Cells: spread ratio, "
+            "value gap, outside share. Spread ratio: the spread of the candidates over that of the "
+            "demonstrated actions; 1 for a generator that models them, near 0 for a clone. Value "
+            "gap: how much more the critics promise for the chosen action than for the "
+            "demonstrated one, in standard deviations of their values. Outside: share of the "
+            "chosen actions that are unlike the demonstrated ones; see "
+            "[diagnostics.md](diagnostics.md)."
+        ),
+        header=("Change", "Preset", "Seed", *map(task_name, TASKS)),
+        rows=[
+            (key[1], key[0], str(key[2]), *(_agent(agents.get(task)) for task in TASKS))
+            for key, agents in runs.items()
+        ],
+    )
+
+
+def _evaluated(published: Published, change: Change) -> list[ResultRow]:
+    """Returns BCQ's evaluated episodes; none if a run of the change has no evaluation."""
+    rows = [e for e in published.episodes if (e.preset, e.ablation) == change]
+    rows = [e for e in rows if (e.row.policy, e.row.latent_source) == BCQ]
+    runs = {run.key for run in published.runs if run.key[:2] == change}
+    return [e.row for e in rows] if {e.key for e in rows} == runs else []
+
+
+def _rolled_out(curves: Sequence[CurveRow], change: Change) -> list[ResultRow]:
+    """Returns the rollouts after the last epoch of each agent as episodes of BCQ."""
+    mine = [curve for curve in curves if curve.key[:2] == change]
+    last: dict[tuple[str, int], int] = {}
+    for c in mine:
+        last[c.task, c.seed] = max(c.epoch, last.get((c.task, c.seed), 0))
+    return [
+        ResultRow(
+            task=c.task,
+            policy=BCQ[0],
+            seed=c.seed,
+            episode=c.episode,
+            episode_return=c.episode_return,
+            success=c.success,
+        )
+        for c in mine
+        if c.epoch == last[c.task, c.seed]
+    ]
+
+
+def _step(change: Change, rows: Sequence[ResultRow], base: Sequence[ResultRow]) -> tuple[str, ...]:
+    cells = []
+    for task in TASKS:
+        mine = [row for row in rows if row.task == task]
+        mean = np.mean([row.episode_return for row in mine]) if mine else 0.0
+        rate = np.mean([bool(row.success) for row in mine]) if mine else 0.0
+        cells.append(f"{mean:.1f} ({percent(float(rate))})" if mine else MISSING)
+    tasks = [task for task in TASKS if any(row.task == task for row in rows)]
+    gain = difference(rows, base, BCQ, BCQ, tasks) if change[1] != "none" else None
+    seeds = ", ".join(map(str, sorted({row.seed for row in rows})))
+    episodes = len({row.episode for row in rows})
+    whole = MISSING if gain is None else share(gain)
+    return change[1], change[0], *cells, whole, seeds, str(episodes)
+
+
+def _agent(row: DiagnosticsRow | None) -> str:
+    if row is None:
+        return MISSING
+    gap = MISSING if row.relative_gap is None else f"{row.relative_gap:+.2f}"
+    return f"{row.spread_ratio:.2f}, {gap}, {percent(row.outside_share)}"
