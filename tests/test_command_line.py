@@ -213,7 +213,7 @@ ABLATIONS = sorted(path.stem for path in (RECIPES / "config" / "ablation").glob(
 
 OF_WEAK = {
     *("acting_100", "acting_first", "autoencoder", "chunks_4", "critics_2", "flow", "gamma_99"),
-    *("no_layer_norm", "published", "raw_rewards", "steps_1", "steps_5"),
+    *("no_advantage", "no_layer_norm", "published", "raw_rewards", "steps_1", "steps_5"),
 }
 """Ablations that undo a step of the preset ``weak``; others may have it undone already."""
 
@@ -273,6 +273,7 @@ def test_what_each_ablation_takes_away_is_away(recipes: Any, tmp_path: Path) -> 
     assert [ablated(x).bcq.generator for x in ("autoencoder", "flow")] == ["autoencoder", "flow"]
     assert [ablated(f"steps_{n}").bcq.n_steps for n in (1, 5)] == [1, 5]
     assert ablated("chunks_4").bcq.action_chunk == 4
+    assert ablated("no_advantage").distill.advantage_weight == 0
     assert not ablated("no_layer_norm").bcq.layer_norm
     assert not ablated("raw_rewards").bcq.standard_reward
     assert ablated("critics_2").bcq.num_qvalue_nets == 2

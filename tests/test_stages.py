@@ -43,7 +43,7 @@ from torchrl_bmrl.pipeline.evaluate import expert_outcomes
 from torchrl_bmrl.pipeline.held_out import COLUMNS, evaluate_held_out
 from torchrl_bmrl.pipeline.learners import Agents
 from torchrl_bmrl.pipeline.stage1 import sizes_of
-from torchrl_bmrl.pipeline.stage2 import train_student, value_statistics
+from torchrl_bmrl.pipeline.stage2 import advantage_scale, train_student, value_statistics
 from torchrl_bmrl.tasks import Task, register_task
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
@@ -179,6 +179,28 @@ def test_values_are_normalised_by_each_teachers_own_or_not_at_all(
         else:
             assert given[name] is None
     assert values[0].shape == (len(TASKS),)
+
+
+@pytest.mark.parametrize("normalise", [True, False])
+def test_advantages_are_measured_in_each_teachers_own_spread_of_proposals(
+    trained: Path, normalise: bool
+) -> None:
+    run = make(trained)
+    teachers = [BCQPolicy.frozen(run.teacher(name), num_candidates=400) for name in run.names]
+    data = [run.transitions(name, "train") for name in run.names]
+    scale = torch.tensor([2.0, 4.0]) if normalise else None
+    found = advantage_scale(teachers, data, scale)
+    for i, (teacher, states) in enumerate(zip(teachers, data, strict=True)):
+        proposed = teacher.propose(states.select("observation"))
+        value = teacher.qvalue_network(proposed)["state_action_value"].squeeze(-1)
+        expected = value.var(-1).mean().sqrt() / (1.0 if scale is None else scale[i])
+        torch.testing.assert_close(found[i], expected, rtol=0.1, atol=0)
+    for teacher in teachers:
+        teacher.qvalue_network.module[-1].weight.zero_()  # one value for all
+    ones = torch.ones(len(teachers))
+    torch.testing.assert_close(
+        advantage_scale(teachers, data, scale), ones if scale is None else ones / scale
+    )
 
 
 # -- evaluation ------------------------------------------------------------------------------------

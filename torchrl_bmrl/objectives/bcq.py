@@ -9,14 +9,14 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from torchrl_bmrl.errors import BMRLError, UnknownNameError
+from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.functional import (
     ACTING_RULES,
     TARGET_RULES,
     bcq_next_value,
     ensemble_value,
 )
-from torchrl_bmrl.objectives.checks import check_number, check_value_bounds
+from torchrl_bmrl.objectives.checks import check_choice, check_number, check_value_bounds
 from torchrl_bmrl.objectives.generative import GenerativeLoss
 
 
@@ -127,11 +127,8 @@ class BCQLoss(GenerativeLoss):
         self.num_candidates = check_number("num_candidates", num_candidates, 1, integer=True)
         self.value_bounds = check_value_bounds(value_bounds)
         self.register_coefficients(high=1.0, lmbda=lmbda)
-        if target_rule not in TARGET_RULES:
-            raise UnknownNameError("target_rule", target_rule, TARGET_RULES)
-        if acting_rule not in ACTING_RULES:
-            raise UnknownNameError("acting_rule", acting_rule, ACTING_RULES)
-        self.target_rule, self.acting_rule = target_rule, acting_rule
+        self.target_rule = check_choice("target_rule", target_rule, TARGET_RULES)
+        self.acting_rule = check_choice("acting_rule", acting_rule, ACTING_RULES)
         self.convert_critics(qvalue_network, num_qvalue_nets)
         self.finish()
 

@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data.tensor_specs import Composite
 
-from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.errors import BMRLError, UnknownNameError
 
 
 def whole_signature(cls: type, without: Sequence[str] = ()) -> inspect.Signature:
@@ -33,6 +33,22 @@ def whole_signature(cls: type, without: Sequence[str] = ()) -> inspect.Signature
             if x.kind is x.KEYWORD_ONLY and x.name not in (*own.parameters, *without)
         ]
     return own.replace(parameters=parameters)
+
+
+def check_choice(name: str, value: Any, choices: Sequence[str]) -> Any:
+    """An option that is one of some names.
+
+    Args:
+        name: the option, for the message.
+        value: what was given.
+        choices: the valid names.
+
+    Raises:
+        UnknownNameError: for another name.
+    """
+    if value not in choices:
+        raise UnknownNameError(name, value, choices)
+    return value
 
 
 def check_number(

@@ -15,11 +15,11 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from torchrl.objectives.utils import ValueEstimators, _vmap_func, distance_loss
 from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_bmrl.errors import BMRLError, UnknownNameError
+from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.functional import average, unpadded
 from torchrl_bmrl.generators import written
 from torchrl_bmrl.objectives.base import KeyedLoss
-from torchrl_bmrl.objectives.checks import check_network, check_number
+from torchrl_bmrl.objectives.checks import check_choice, check_network, check_number
 from torchrl_bmrl.objectives.data import missing, next_key, select
 from torchrl_bmrl.objectives.ensemble import Ensemble, can_stack, copies
 from torchrl_bmrl.objectives.estimators import make_estimator, outcomes
@@ -96,10 +96,8 @@ class OfflineLoss(KeyedLoss):
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        if loss_function not in LOSS_FUNCTIONS:
-            raise UnknownNameError("loss_function", loss_function, LOSS_FUNCTIONS)
         self._gamma = check_number("gamma", gamma, 0, 1)
-        self.loss_function = loss_function
+        self.loss_function = check_choice("loss_function", loss_function, LOSS_FUNCTIONS)
         self.separate_losses = separate_losses
 
     # -- construction ----------------------------------------------------------------------------

@@ -14,18 +14,20 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from torchrl_bmrl import functional
-from torchrl_bmrl.errors import BMRLError, UnknownNameError
+from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.generators import written
 from torchrl_bmrl.objectives.base import KeyedLoss
-from torchrl_bmrl.objectives.checks import check_number
+from torchrl_bmrl.objectives.checks import check_choice, check_number
 from torchrl_bmrl.objectives.data import check_same_shape, check_tasks, entry, next_key, select
 from torchrl_bmrl.objectives.ensemble import FrozenEnsemble
 from torchrl_bmrl.objectives.sizes import is_lazy, shapes_of, warm_up
+from torchrl_bmrl.objectives.student_terms import advantage, isometry
 from torchrl_bmrl.objectives.task_rows import draw_others, draw_rows
 from torchrl_bmrl.objectives.teachers import check_teachers, per_task
 
 CONTEXTS = ("current", "previous", "random", "set")
 ENCODER_TERMS = ("classification", "generator", "direction", "qvalue", "metric")
+OTHER_TERMS = ("isometry", "advantage")
 
 
 class MetaDistillationLoss(KeyedLoss):
@@ -41,18 +43,21 @@ class MetaDistillationLoss(KeyedLoss):
           + w_q \left(\hat Q(s, \hat g, m) - \tilde Q_i(s, g)\right)^2
           + w_m \lVert m \rVert_2^2
           + w_t \max(0, \lVert m - m^+ \rVert - \lVert m - m^- \rVert + \alpha)
-          + w_s \left(\lVert m - m^+ \rVert - \lVert c - c^+ \rVert\right)^2,
+          + w_s \left(\lVert m - m^+ \rVert - \lVert c - c^+ \rVert\right)^2
+          + w_a \left((\hat Q - \hat Q') - (\tilde Q_i - \tilde Q_i')\right)^2 / \kappa_i^2,
           \quad c = (r / \rho_i, G_i(s, 0))
 
     Deviations from the paper are the penalty on m, the normalised :math:`\tilde Q_i = (Q_i -
-    \mu_i)/\sigma_i` and ``context``; docs/distillation.md explains them. The last two terms are off
-    by default: in the triplet loss (https://arxiv.org/abs/1909.11373) :math:`m^+` embeds another
-    transition of the task and :math:`m^-` one of another task; the isometry term makes distances in
-    m those of reward and teacher's action c, over all pairs of a task's rows. :math:`\hat Q` is
-    trained at :math:`\hat g` without a gradient into the student's generator.
+    \mu_i)/\sigma_i` and ``context``; docs/distillation.md explains them. The last three terms
+    are off by default: in the triplet loss (https://arxiv.org/abs/1909.11373) :math:`m^+` embeds
+    another transition of the task and :math:`m^-` one of another task; the isometry term makes
+    distances in m those of reward and teacher's action c, over all pairs of a task's rows; the
+    advantage term compares the values of two latents of a state, by whose differences alone a
+    policy chooses.
+    :math:`\hat Q` is trained at :math:`\hat g` without a gradient into the student's generator.
 
-    The teachers are frozen: row i of the data is task i. Any decoders and critics will do; those of
-    equal shapes run as one batched ensemble. A perturbation network is not distilled.
+    The teachers are frozen: row i of the data is task i. Those of equal shapes run as one batched
+    ensemble. A perturbation network is not distilled.
 
     Args:
         task_encoder: M, (observation, action, next reward, next observation) → ``task_latent``.
@@ -66,15 +71,15 @@ class MetaDistillationLoss(KeyedLoss):
         latent_dim: size of ``action_latent``.
         latent_clip: bound on z, the one that the teachers act with; ``None`` for none.
         qvalue_loc: μ_i, ``(num_tasks,)``; ``None`` for 0.
-        qvalue_scale, reward_scale: σ_i and ρ_i, ``(num_tasks,)``, positive; ``None`` for 1.
-        classification_weight, generator_weight, direction_weight: w_c, w_g, w_d.
-        qvalue_weight, latent_norm_weight: w_q, w_m.
-        metric_weight: w_t; 0 leaves the term out.
+        qvalue_scale, reward_scale, advantage_scale: σ_i, ρ_i and κ_i, ``(num_tasks,)``, positive;
+            ``None`` for 1.
+        classification_weight, generator_weight, direction_weight, qvalue_weight,
+            latent_norm_weight: w_c, w_g, w_d, w_q, w_m.
+        metric_weight, isometry_weight, advantage_weight: w_t, w_s, w_a; 0 leaves the term out.
         metric_margin: α, in units of m.
-        isometry_weight: w_s; 0 leaves the term out.
         encoder_terms: terms whose gradient reaches M, of ``"classification"``, ``"generator"``,
-            ``"direction"``, ``"qvalue"`` and ``"metric"``; the penalty on m and the isometry term
-            always reach it. ``("classification",)`` is the paper's reading.
+            ``"direction"``, ``"qvalue"`` (the advantage term, too) and ``"metric"``; the penalty on
+            m and the isometry term always reach it. ``("classification",)`` is the paper's reading.
         context: which transition m is computed from: ``"current"`` (the paper's), ``"previous"``
             (the one before it in the episode, under the key ``"previous"``), ``"random"`` (another
             one of the task in the batch) or ``"set"`` (the mean over ``context_size`` random ones).
@@ -128,7 +133,7 @@ class MetaDistillationLoss(KeyedLoss):
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     _schedulable_buffers = frozenset(
-        {"latent_clip", *(f"{term}_weight" for term in (*ENCODER_TERMS, "latent_norm", "isometry"))}
+        {"latent_clip", *(f"{x}_weight" for x in (*ENCODER_TERMS, "latent_norm", *OTHER_TERMS))}
     )
     task_encoder: TensorDictModule
     task_encoder_params: TensorDictParams
@@ -165,6 +170,8 @@ class MetaDistillationLoss(KeyedLoss):
         metric_weight: float = 0.0,
         metric_margin: float = 1.0,
         isometry_weight: float = 0.0,
+        advantage_weight: float = 0.0,
+        advantage_scale: Tensor | None = None,
         encoder_terms: Sequence[str] = ENCODER_TERMS,
         context: str = "set",
         context_fraction: float = 0.5,
@@ -172,20 +179,15 @@ class MetaDistillationLoss(KeyedLoss):
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        if context not in CONTEXTS:
-            raise UnknownNameError("context", context, CONTEXTS)
-        encoder_terms = (encoder_terms,) if isinstance(encoder_terms, str) else tuple(encoder_terms)
-        for term in encoder_terms:
-            if term not in ENCODER_TERMS:
-                raise UnknownNameError("encoder term", term, ENCODER_TERMS)
+        terms = (encoder_terms,) if isinstance(encoder_terms, str) else encoder_terms
+        self.encoder_terms = tuple(check_choice("encoder term", x, ENCODER_TERMS) for x in terms)
         if metric_weight and len(teacher_generators) < 2:
             raise BMRLError("metric_weight needs at least two tasks")
         self.num_tasks = len(teacher_generators)
         self.latent_dim = check_number("latent_dim", latent_dim, 1, integer=True)
-        self.context = context
+        self.context = check_choice("context", context, CONTEXTS)
         self.context_fraction = check_number("context_fraction", context_fraction, 0, 1)
         self.context_size = check_number("context_size", context_size, 1, integer=True)
-        self.encoder_terms = encoder_terms
         self.metric_margin = check_number("metric_margin", metric_margin)
         names = ("task_encoder", "task_classifier", "student_generator", "student_qvalue_network")
         networks = (task_encoder, task_classifier, student_generator, student_qvalue_network)
@@ -198,8 +200,10 @@ class MetaDistillationLoss(KeyedLoss):
         self.teacher_generators, self.teacher_qvalue_networks = map(FrozenEnsemble, teachers)
         like = next(student_generator.parameters()).new_zeros(self.num_tasks)
         self.register_buffer("qvalue_loc", per_task("qvalue_loc", qvalue_loc, like))
-        self.register_buffer("qvalue_scale", per_task("qvalue_scale", qvalue_scale, like + 1))
-        self.register_buffer("reward_scale", per_task("reward_scale", reward_scale, like + 1))
+        scales = {"qvalue": qvalue_scale, "reward": reward_scale, "advantage": advantage_scale}
+        for name, scale in scales.items():
+            name = f"{name}_scale"
+            self.register_buffer(name, per_task(name, scale, like + 1))
         self.register_coefficients(
             classification_weight=classification_weight,
             generator_weight=generator_weight,
@@ -212,6 +216,7 @@ class MetaDistillationLoss(KeyedLoss):
             latent_clip=latent_clip,
             metric_weight=metric_weight or None,
             isometry_weight=isometry_weight or None,
+            advantage_weight=advantage_weight or None,
         )
         self.keep_keys()
 
@@ -241,7 +246,8 @@ class MetaDistillationLoss(KeyedLoss):
     def written_keys(self) -> list[str]:
         """The weighted terms, then metrics."""
         terms = ["classification", "generator", "direction", "qvalue", "latent_norm"]
-        terms += [x for x in ("metric", "isometry") if getattr(self, f"{x}_weight") is not None]
+        optional = ("metric", *OTHER_TERMS)
+        terms += [x for x in optional if getattr(self, f"{x}_weight") is not None]
         return [*(f"loss_{term}" for term in terms), "accuracy", "latent_norm"]
 
     @property
@@ -272,8 +278,7 @@ class MetaDistillationLoss(KeyedLoss):
         else:
             # The other rows of a task are draws from its data, and so are its context.
             size = self.context_size if self.context == "set" else 1
-            valid = self.valid_rows(tensordict, latent.shape[:2])
-            other = draw_rows(latent, valid, size).mean(2)
+            other = draw_rows(latent, self.valid_rows(tensordict, latent.shape[:2]), size).mean(2)
         chosen = torch.rand(latent.shape[:2], device=latent.device) < self.context_fraction
         return torch.where(chosen.unsqueeze(-1), other, latent)
 
@@ -321,18 +326,6 @@ class MetaDistillationLoss(KeyedLoss):
 
     def _ask(self, teachers: Any, data: TensorDictBase) -> TensorDictBase:
         return teachers(data, randomness=self.vmap_randomness, loop=self.deactivate_vmap)
-
-    def _isometry(self, tensordict: TensorDictBase) -> Tensor:
-        """Isometry error of each row's m to the other rows of its task, ``(num_tasks, B)``."""
-        valid = self.valid_rows(tensordict, tensordict.batch_size)
-        reward = entry(tensordict, next_key(self.tensor_keys.reward), valid)
-        # The latent 0 gives the demonstrator's action without its noise.
-        centre = self.qvalue_loc.new_zeros(*tensordict.batch_size, self.latent_dim)
-        with torch.no_grad():
-            action = self._demonstrate(tensordict, centre).get(self.tensor_keys.action)
-        content = torch.cat([reward / self.reward_scale[:, None, None], action], -1)
-        # Not embed(): a set has no reward and action of its own.
-        return functional.isometry_error(self._encode(tensordict), content, valid)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -391,7 +384,10 @@ class MetaDistillationLoss(KeyedLoss):
             triplet = functional.triplet_error(reaching["metric"], near, far, self.metric_margin)
             terms["loss_metric"] = self.metric_weight * triplet
         if self.isometry_weight is not None:
-            terms["loss_isometry"] = self.isometry_weight * self._isometry(tensordict)
+            terms["loss_isometry"] = self.isometry_weight * isometry(self, tensordict)
+        if self.advantage_weight is not None:
+            error = advantage(self, tensordict, value, target_value, reaching["qvalue"])
+            terms["loss_advantage"] = self.advantage_weight * error
         priority = sum(terms.values()).detach()
         tensordict.set(self.tensor_keys.priority, functional.unpadded(priority, valid))
         losses = {name: self.reduce(term, tensordict) for name, term in terms.items()}

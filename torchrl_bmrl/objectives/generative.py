@@ -14,7 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data.tensor_specs import Bounded, TensorSpec
 
-from torchrl_bmrl.errors import BMRLError, UnknownNameError
+from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.functional import average, perturbed_action
 from torchrl_bmrl.generators import (
     LOSS_OPTIONS,
@@ -23,7 +23,7 @@ from torchrl_bmrl.generators import (
     check_bounds,
     written,
 )
-from torchrl_bmrl.objectives.checks import check_network, leaf_of
+from torchrl_bmrl.objectives.checks import check_choice, check_network, leaf_of
 from torchrl_bmrl.objectives.common import OfflineLoss
 from torchrl_bmrl.objectives.data import check_same_shape, check_within, next_key
 from torchrl_bmrl.objectives.swap import holding, unfit
@@ -109,9 +109,7 @@ class GenerativeLoss(OfflineLoss):
     ) -> None:
         super().__init__(**options)
         generator = as_generator(generator)
-        if kl_reduction not in KL_REDUCTIONS:
-            raise UnknownNameError("kl_reduction", kl_reduction, KL_REDUCTIONS)
-        self.kl_reduction = kl_reduction
+        self.kl_reduction = check_choice("kl_reduction", kl_reduction, KL_REDUCTIONS)
         self.check_sizes("generator", generator)
         self.convert_to_functional(generator, "generator", create_target_params=False)
         low, high = action_bounds(action_spec, bounds, self.tensor_keys.action)

@@ -128,6 +128,7 @@ class DistillSettings:
     metric_weight: float = setting(0.0, at_least=0)  # weight of the triplet loss on m
     metric_margin: float = setting(1.0, at_least=0)  # margin of the triplet loss
     isometry_weight: float = setting(1.0, at_least=0)  # weight of the isometry of m
+    advantage_weight: float = setting(0.0, at_least=0)  # weight of differences within a state
     normalise_qvalue: bool = True  # with each teacher's mean and deviation
     prototype: str = setting("mean", choices=("mean", "medoid"))  # a task's point of m
 

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_bmrl.data import make_multi_task_replay_buffer, with_previous
-from torchrl_bmrl.functional import sample_action_latent
+from torchrl_bmrl.functional import nonzero_scale, sample_action_latent
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.pipeline.agents import Student, make_distillation_loss
@@ -78,6 +78,30 @@ def value_statistics(
     return torch.stack([v.mean() for v in values]), torch.stack([deviation(v) for v in values])
 
 
+@torch.no_grad()
+def advantage_scale(
+    teachers: list[BCQPolicy], datasets: list[TensorDictBase], qvalue_scale: Tensor | None
+) -> Tensor:
+    """Returns the deviation of each teacher's value among the proposals of a state.
+
+    Args:
+        teachers: one per task.
+        datasets: the states, ``[N_i]`` each; 512 of them are used.
+        qvalue_scale: deviations that the values are divided by; ``None`` for 1.
+
+    Returns:
+        ``(num_tasks,)``; 1 where all proposals have one value.
+    """
+    scales = []
+    for teacher, data in zip(teachers, datasets, strict=True):
+        states = data[:: max(1, len(data) // 512)].select("observation")
+        value = teacher.qvalue_network(teacher.propose(states)).get("state_action_value")
+        spread = value.var(-2).mean().sqrt()
+        scales.append(nonzero_scale(spread, value.abs().max(), value.dtype))
+    scale = torch.stack(scales)
+    return scale if qvalue_scale is None else scale / qvalue_scale
+
+
 def loss_options(settings: DistillSettings) -> dict[str, Any]:
     """Returns the settings that are options of :class:`.MetaDistillationLoss`."""
     others = OF_THE_STUDENT + OF_THE_TRAINING
@@ -114,6 +138,9 @@ def train_student(job: tuple[Run, None], report: Report) -> None:
         teachers,
         qvalue_loc=normalisation[0],
         qvalue_scale=normalisation[1],
+        advantage_scale=advantage_scale(teachers, train, normalisation[1])
+        if distill.advantage_weight
+        else None,
         reward_scale=torch.stack([deviation(data["next", "reward"]) for data in train]),
         **loss_options(distill),
     ).to(settings.device)
