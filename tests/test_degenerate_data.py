@@ -200,11 +200,11 @@ def test_stage_2_divides_by_one_where_rewards_are_all_the_same(
 ) -> None:
     for package in ("h5py", "gymnasium", "safetensors", "tqdm"):
         pytest.importorskip(package)
-    from torchrl_bmrl.pipeline.stage2 import spread
+    from torchrl_bmrl.pipeline.training_data import deviation
 
-    assert spread(torch.tensor(values).unsqueeze(-1)).item() == 1.0
+    assert deviation(torch.tensor(values).unsqueeze(-1)).item() == 1.0
     varied = torch.tensor([[1.0], [3.0]])
-    assert torch.equal(spread(varied), varied.std())
+    assert torch.equal(deviation(varied), varied.std())
 
 
 # -- evaluation ------------------------------------------------------------------------------------

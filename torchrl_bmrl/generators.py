@@ -180,7 +180,8 @@ class Autoencoder(LatentGenerator):
     @property
     def sizes(self) -> dict[NestedKey, int]:
         """Sizes of the entries, as far as encoder and decoder declare them."""
-        return dict(getattr(self.encoder, "sizes", {})) | super().sizes
+        parts = (self.encoder, self.decoder)  # super().sizes would stop torch.export
+        return {k: size for part in parts for k, size in getattr(part, "sizes", {}).items()}
 
     def row_loss(
         self, tensordict: TensorDictBase, keys: ActionKeys, *, kl_weight: Any, kl_reduction: str

@@ -73,8 +73,8 @@ class MetaDistillationLoss(KeyedLoss):
         qvalue_loc: μ_i, ``(num_tasks,)``; ``None`` for 0.
         qvalue_scale, reward_scale, advantage_scale: σ_i, ρ_i and κ_i, ``(num_tasks,)``, positive;
             ``None`` for 1.
-        classification_weight, generator_weight, direction_weight, qvalue_weight,
-            latent_norm_weight: w_c, w_g, w_d, w_q, w_m.
+        classification_weight, generator_weight, direction_weight: w_c, w_g, w_d.
+        qvalue_weight, latent_norm_weight: w_q, w_m.
         metric_weight, isometry_weight, advantage_weight: w_t, w_s, w_a; 0 leaves the term out.
         metric_margin: α, in units of m.
         encoder_terms: terms whose gradient reaches M, of ``"classification"``, ``"generator"``,
