@@ -125,7 +125,7 @@ def test_one_seed_gives_the_same_bytes_in_one_go_and_recipe_by_recipe(
     for stage in (collect, stage1, stage2, evaluate):
         run(tmp_path, stage)
     expected = result_files(finished)
-    assert len(expected) == 1 + 6 + 2
+    assert len(expected) == 1 + 8 + 2
     assert result_files(tmp_path) == expected
     costly = ("data/*", "**/*.safetensors")
     assert contents(tmp_path, *costly) == contents(finished, *costly)

@@ -67,18 +67,19 @@ def stage1(run: Run) -> None:
         for task in run.settings.only or run.names
     }
     stacked = bcq.stacked and len(agents) > 1
-    run.jobs(
+    trained = run.jobs(
         train_job,
         [agents] if stacked else [{name: task} for name, task in agents.items()],
         total=bcq.epochs * bcq.updates_per_epoch * len(agents),
         description="stage 1: training BCQ",
         unit="update",
     )
-    _log_diagnostics(run, agents)
+    if any(trained):  # a finished run says nothing new
+        _log_diagnostics(run, agents)
 
 
-def train_job(job: tuple[Run, dict[str, str]], report: Report) -> None:
-    """Trains agents (tasks by agent name) on their tasks' demonstrations."""
+def train_job(job: tuple[Run, dict[str, str]], report: Report) -> bool:
+    """Trains agents (tasks by agent name); returns whether there was something to train."""
     run, agents = job
     datasets = [
         part
@@ -93,7 +94,7 @@ def train_job(job: tuple[Run, dict[str, str]], report: Report) -> None:
         buffer = make_replay_buffer(datasets[0], **options)
     else:
         buffer = make_multi_task_replay_buffer(datasets, **options)
-    train_agents(run, agents, buffer, report, datasets=datasets)
+    return train_agents(run, agents, buffer, report, datasets=datasets)
 
 
 def sizes_of(data: TensorDictBase) -> dict[str, int]:
@@ -108,7 +109,7 @@ def train_agents(
     report: Report,
     *,
     datasets: Sequence[TensorDictBase],
-) -> None:
+) -> bool:
     """Trains agents on samples of a buffer, or resumes from their checkpoint.
 
     Args:
@@ -117,6 +118,9 @@ def train_agents(
         buffer: samples are ``[batch]`` for one agent and ``[agents, batch]`` for several.
         report: called with the number of new updates.
         datasets: the transitions of each agent, ``[N_i]``, on which it is diagnosed.
+
+    Returns:
+        whether there was something to train.
 
     Raises:
         BMRLError: naming the agents that diverged, after the others are trained.
@@ -129,7 +133,8 @@ def train_agents(
         log.debug("bcq %s: resumed from update %d", ", ".join(agents), trained.updates)
         report(trained.updates * len(agents))
     total = bcq.epochs * bcq.updates_per_epoch
-    if trained.updates < total:
+    unfinished = trained.updates < total
+    if unfinished:
         choose = choose_updates(run, trained.loss, trained.optimizers, trained.targets)
         with ExitStack() as stack:
             loggers = {}
@@ -178,6 +183,7 @@ def train_agents(
             )
     if trained.diverged:
         raise BMRLError("; ".join(trained.diverged.values()))
+    return unfinished
 
 
 def _sample(run: Run, name: str, data: TensorDictBase) -> TensorDictBase:
