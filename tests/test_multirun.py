@@ -326,7 +326,7 @@ def test_agents_spread_over_jobs_are_those_of_one_run(run: Any, tmp_path: Path) 
     done = recipe("train_bcq", "--multirun", *SMALL, *options, *launcher, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     expected = contents(one, "bcq/**/*")
-    assert len(expected) == 9  # checkpoint, best networks and rollouts of each
+    assert len(expected) == 12  # checkpoint, best networks, rollouts and diagnostics of each
     assert contents(spread, "bcq/**/*") == expected
 
 
