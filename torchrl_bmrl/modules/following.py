@@ -193,21 +193,30 @@ class Link:
 
     def leaves(self, loss: Any) -> list[Tensor]:
         """The loss's parameters and buffers, in the order of the network's own."""
-        params = _held(loss, self.name, self.critic)[1]
+        params = _params(loss, self.name, self.critic)
         return [params.get(key) for key in self.keys]
 
 
-def _held(loss: Any, name: str, critic: str | None) -> tuple[Any, TensorDictBase]:
-    """A loss's network and its parameters; of critics the first, or all as one network."""
-    if critic is not None and hasattr(loss, "critic"):
-        if critic == "first":
-            return loss.critic(0)
-        modules, params = zip(*map(loss.critic, range(loss.num_qvalue_nets)), strict=True)
-        own = {str(i): each for i, each in enumerate(params)}
-        copies = [deepcopy(module) for module in modules]  # a stack has one module for all
-        return EnsembleCritic(copies, critic), TensorDict({"critics": own})
-    params = getattr(loss, f"{name}_params")
-    return getattr(loss, name), getattr(params, "_param_td", params)
+def _module(loss: Any, name: str, critic: str | None) -> Any:
+    """A loss's network; of critics the first, or all as one network."""
+    if critic is None or not hasattr(loss, "critic"):
+        return getattr(loss, name)
+    if critic == "first":
+        return loss.critic(0)[0]
+    # Copies: critics whose parameters are stacked share one module.
+    critics = [deepcopy(loss.critic(i)[0]) for i in range(loss.num_qvalue_nets)]
+    return EnsembleCritic(critics, critic)
+
+
+def _params(loss: Any, name: str, critic: str | None) -> TensorDictBase:
+    """The parameters of :func:`_module` in the loss."""
+    if critic is None or not hasattr(loss, "critic"):
+        params = getattr(loss, f"{name}_params")
+        return getattr(params, "_param_td", params)
+    if critic == "first":
+        return loss.critic(0)[1]
+    own = {str(i): loss.critic(i)[1] for i in range(loss.num_qvalue_nets)}
+    return TensorDict({"critics": own})
 
 
 def link(
@@ -232,8 +241,8 @@ def link(
             f"{type(loss).__name__} has no {name}; valid: a loss that trains one, or the policy's "
             "own constructor"
         )
-    module, params = _held(loss, name, critic)
-    return Link(_instantiate(module, params, live), name, critic)
+    module = _instantiate(_module(loss, name, critic), _params(loss, name, critic), live)
+    return Link(module, name, critic)
 
 
 def as_number(value: Any) -> Any:
