@@ -51,6 +51,7 @@ _NEEDS = {
                 "d4rl_files",
                 "d4rl_mutations",
                 "episode_files",
+                "file_runs",
                 "file_edits",
                 "lerobot_files",
                 "minari_files",

@@ -15,7 +15,7 @@ pytest.importorskip("tqdm")
 pytest.importorskip("yaml")
 
 import torch
-from episode_files import write_file
+from file_runs import file_run, write_demonstrations
 from tensordict import TensorDict
 
 from torchrl_bmrl.errors import ConfigError
@@ -23,8 +23,6 @@ from torchrl_bmrl.modules import ActionFlow, ActionMixture, BCQPolicy, ChunkPoli
 from torchrl_bmrl.objectives import BCQLoss
 from torchrl_bmrl.pipeline import (
     BCQSettings,
-    DistillSettings,
-    EvaluateSettings,
     Run,
     Settings,
     collect,
@@ -36,34 +34,11 @@ from torchrl_bmrl.pipeline.training_data import reward_statistics, training_data
 from torchrl_bmrl.pipeline.two_stage import two_stage
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
-TASKS = ("door", "drawer")
-PARTS = {"arm": ((3,), "float64")}
-
-
-def make(folder: Path, **bcq: Any) -> Run:
-    """A small run of two tasks whose demonstrations lie in its folder."""
-    small = {"batch_size": 4, "num_cells": [8]}
-    files = {name: {"demonstrations": str(folder / f"{name}.hdf5")} for name in TASKS}
-    return Run(
-        Settings(
-            run_dir=str(folder),
-            workers=1,
-            tasks=files,
-            bcq=BCQSettings(**({"epochs": 1, "updates_per_epoch": 3, **small} | bcq)),
-            distill=DistillSettings(updates=3, **small),
-            evaluate=EvaluateSettings(episodes=1, num_candidates=3),
-        )
-    )
-
-
-def written(folder: Path, **bcq: Any) -> Run:
-    for index, name in enumerate(TASKS):
-        write_file(folder / f"{name}.hdf5", [n + index for n in (5, 6, 7, 8)], parts=PARTS)
-    return make(folder, **bcq)
-
 
 def trained(folder: Path, **bcq: Any) -> Run:
-    run = written(folder, **bcq)
+    """A run with demonstrations and stage 1."""
+    write_demonstrations(folder)
+    run = file_run(folder, bcq=bcq)
     with run:
         collect(run)
         stage1(run)
@@ -204,7 +179,7 @@ def test_agents_of_chunks_play_them_action_by_action(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("stage", [stage2, two_stage], ids=["stage2", "two_stage"])
 def test_the_distillation_refuses_chunks_before_it_begins(tmp_path: Path, stage: Any) -> None:
-    run = written(tmp_path, action_chunk=3)
+    run = file_run(tmp_path, bcq={"action_chunk": 3})
     with run, pytest.raises(ConfigError, match=r"bcq.action_chunk is 3; valid for the distill"):
         stage(run)
     assert not (tmp_path / "data").exists()

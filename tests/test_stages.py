@@ -22,6 +22,7 @@ pytest.importorskip("yaml")
 
 import torch
 from episode_files import make_episode, write_file
+from file_runs import PARTS, TASKS, UPDATES, file_run, write_demonstrations
 
 from torchrl_bmrl.data.importing import read_original_bounds
 from torchrl_bmrl.data.robomimic import write_episodes
@@ -30,9 +31,6 @@ from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
 from torchrl_bmrl.files import read_rows
 from torchrl_bmrl.modules import BCQPolicy, prototype
 from torchrl_bmrl.pipeline import (
-    BCQSettings,
-    DistillSettings,
-    EvaluateSettings,
     Run,
     Settings,
     collect,
@@ -47,44 +45,21 @@ from torchrl_bmrl.pipeline.stage2 import advantage_scale, train_student, value_s
 from torchrl_bmrl.tasks import Task, register_task
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
-TASKS = ("door", "drawer")
-UPDATES = 6
-PARTS = {"arm": ((3,), np.float64)}
-
-
-def make(folder: Path, *, keep: int = 2, **distill: Any) -> Run:
-    """A small run of two tasks whose demonstrations lie in its folder."""
-    small = {"batch_size": 4, "num_cells": [8]}
-    files = {name: {"demonstrations": str(folder / f"{name}.hdf5")} for name in TASKS}
-    return Run(
-        Settings(
-            run_dir=str(folder),
-            workers=1,
-            tasks=files,
-            bcq=BCQSettings(epochs=1, updates_per_epoch=6, **small),
-            distill=DistillSettings(**({"updates": UPDATES, **small} | distill)),
-            evaluate=EvaluateSettings(episodes=1, num_candidates=3),
-            checkpoint_interval=2,
-            keep_checkpoints=keep,
-        )
-    )
-
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run with stage 1."""
     folder = tmp_path_factory.mktemp("trained")
-    for index, name in enumerate(TASKS):
-        write_file(folder / f"{name}.hdf5", [n + index for n in (5, 6, 7, 8)], parts=PARTS)
-    with make(folder) as run:
+    write_demonstrations(folder)
+    with file_run(folder) as run:
         collect(run)
         stage1(run)
     return folder
 
 
-def distilled(trained: Path, folder: Path, **settings: Any) -> Run:
+def distilled(trained: Path, folder: Path, *, keep: int = 2, **settings: Any) -> Run:
     """A run that went on from stage 1 with other settings of stage 2."""
-    run = make(folder, **settings)
+    run = file_run(folder, distill=settings, keep=keep)
     for part in ("data", "bcq"):
         shutil.copytree(trained / part, folder / part)
     with run:
@@ -100,7 +75,7 @@ def test_files_without_an_environment_share_the_bounds_of_all_their_actions(tmp_
         episodes = [make_episode(i, parts=PARTS) for i in range(2)]
         path = tmp_path / f"{name}.hdf5"
         write_episodes(path, episodes, env_args={}, bounds=(-bound, bound))
-    run = make(tmp_path)
+    run = file_run(tmp_path)
     with run:
         collect(run)
     for name in TASKS:
@@ -111,7 +86,7 @@ def test_files_without_an_environment_share_the_bounds_of_all_their_actions(tmp_
 
 
 def test_the_best_agent_is_that_of_the_epoch_with_the_highest_mean_return(trained: Path) -> None:
-    run = make(trained)
+    run = file_run(trained)
     agents = Agents(run, {"door-9": "door"}, sizes_of(run.transitions("door", "train")))
     path = run.agent_path("door-9").with_name("best.safetensors")
     for epoch, returns, best in ((1, (0.0, 4.0), 1), (2, (3.0, 0.0), 1), (3, (2.0, 2.0), 3)):
@@ -185,7 +160,7 @@ def test_values_are_normalised_by_each_teachers_own_or_not_at_all(
 def test_advantages_are_measured_in_each_teachers_own_spread_of_proposals(
     trained: Path, normalise: bool
 ) -> None:
-    run = make(trained)
+    run = file_run(trained)
     teachers = [BCQPolicy.frozen(run.teacher(name), num_candidates=400) for name in run.names]
     data = [run.transitions(name, "train") for name in run.names]
     scale = torch.tensor([2.0, 4.0]) if normalise else None
