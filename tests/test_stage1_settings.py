@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,9 @@ import pytest
 
 pytest.importorskip("gymnasium")
 pytest.importorskip("h5py")
+pytest.importorskip("matplotlib")
 pytest.importorskip("safetensors")
+pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 pytest.importorskip("yaml")
 
@@ -32,11 +35,13 @@ from torchrl_bmrl.pipeline import (
 from torchrl_bmrl.pipeline.stage1 import make_policy
 from torchrl_bmrl.pipeline.training_data import reward_statistics, training_data
 from torchrl_bmrl.pipeline.two_stage import two_stage
+from torchrl_bmrl.studies import fqe, people
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 
 def trained(folder: Path, **bcq: Any) -> Run:
     """A run with demonstrations and stage 1."""
+    folder.mkdir(parents=True, exist_ok=True)
     write_demonstrations(folder)
     run = file_run(folder, bcq=bcq)
     with run:
@@ -128,10 +133,12 @@ def test_equal_rewards_are_shifted_to_zero_and_not_divided_by_zero() -> None:
 
 def test_the_first_part_of_the_data_decides_the_scale_of_all() -> None:
     first, second = training_data(
-        [data([1.0, 2.0, 6.0]), data([3.0, 3.0])], BCQSettings(standard_reward=True)
+        [data([1.0, 2.0, 6.0]), data([5.0, 9.0])], BCQSettings(standard_reward=True)
     )
-    assert second["next", "reward"].flatten().tolist() == pytest.approx([0.0, 0.0], abs=1e-6)
-    assert first["next", "reward"].flatten()[-1] > 1
+    deviation = torch.tensor([1.0, 2.0, 6.0]).std()
+    for part, rewards in ((first, [1.0, 2.0, 6.0]), (second, [5.0, 9.0])):
+        expected = (torch.tensor(rewards) - 3.0) / deviation
+        torch.testing.assert_close(part["next", "reward"].flatten(), expected)
 
 
 def test_the_outcome_of_a_row_is_that_of_its_steps_or_of_its_chunk() -> None:
@@ -147,10 +154,9 @@ def test_with_the_defaults_the_data_are_those_that_were_given() -> None:
     assert training_data([before], BCQSettings())[0] is before
 
 
-@pytest.mark.parametrize("option", ["n_steps", "action_chunk"])
-def test_the_critics_discount_by_the_steps_of_each_row(
-    tmp_path: Path, option: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def batches(monkeypatch: pytest.MonkeyPatch) -> list[TensorDict]:
+    """Batches that the critics of BCQ are trained on from now on."""
     seen: list[TensorDict] = []
     run_loss = BCQLoss.qvalue_loss
 
@@ -159,9 +165,33 @@ def test_the_critics_discount_by_the_steps_of_each_row(
         return run_loss(self, batch)
 
     monkeypatch.setattr(BCQLoss, "qvalue_loss", spy)
+    return seen
+
+
+def most_steps(batches: list[TensorDict]) -> int:
+    return max(int(batch["steps_to_next_obs"].max()) for batch in batches)
+
+
+@pytest.mark.parametrize("option", ["n_steps", "action_chunk"])
+def test_the_critics_discount_by_the_steps_of_each_row(
+    tmp_path: Path, option: str, batches: list[TensorDict]
+) -> None:
     trained(tmp_path, **{option: 3})
-    steps = torch.cat([batch["steps_to_next_obs"].flatten() for batch in seen])
-    assert steps.max() == 3
+    assert most_steps(batches) == 3
+
+
+def test_studies_train_on_the_data_of_stage_1(tmp_path: Path, batches: list[TensorDict]) -> None:
+    run = trained(tmp_path / "runs", n_steps=3)
+    batches.clear()
+    with run:
+        fqe.train_job((run, ("door", [2])), lambda updates: None)
+    assert most_steps(batches) == 3
+    batches.clear()
+    run.tasks = run.tasks[:1]  # a study of people has one task
+    shutil.copy(run.demonstrations("door"), tmp_path / "demonstrations.hdf5")
+    with run:
+        people.train_job((run, (0.5, 0)), lambda updates: None)
+    assert most_steps(batches) == 3
 
 
 # -- chunks ----------------------------------------------------------------------------------------

@@ -133,18 +133,24 @@ def test_so_many_checkpoints_are_kept_as_the_settings_say(
     assert len(list((trained / "bcq" / "door").glob("checkpoint*"))) == 2
 
 
-@pytest.mark.parametrize("normalise", [True, False])
-def test_values_are_normalised_by_each_teachers_own_or_not_at_all(
-    trained: Path, tmp_path: Path, normalise: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def given(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Options of the distillation's loss, once a stage 2 has begun."""
     module: Any = sys.modules[train_student.__module__]  # the function stage2 hides it
-    whole, given = module.make_distillation_loss, {}
+    whole, options = module.make_distillation_loss, {}
 
-    def spy(*networks: Any, **options: Any) -> Any:
-        given.update(options)
-        return whole(*networks, **options)
+    def spy(*networks: Any, **given: Any) -> Any:
+        options.update(given)
+        return whole(*networks, **given)
 
     monkeypatch.setattr(module, "make_distillation_loss", spy)
+    return options
+
+
+@pytest.mark.parametrize("normalise", [True, False])
+def test_values_are_normalised_by_each_teachers_own_or_not_at_all(
+    trained: Path, tmp_path: Path, normalise: bool, given: dict[str, Any]
+) -> None:
     run = distilled(trained, tmp_path, normalise_qvalue=normalise)
     data = [run.transitions(name, "train") for name in run.names]
     values = value_statistics([BCQPolicy.frozen(run.teacher(name)) for name in run.names], data)
@@ -154,6 +160,16 @@ def test_values_are_normalised_by_each_teachers_own_or_not_at_all(
         else:
             assert given[name] is None
     assert values[0].shape == (len(TASKS),)
+
+
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_advantages_have_a_scale_where_they_are_distilled(
+    trained: Path, tmp_path: Path, weight: float, given: dict[str, Any]
+) -> None:
+    distilled(trained, tmp_path, advantage_weight=weight)
+    scale = given["advantage_scale"]
+    assert (scale is not None) == (weight > 0)
+    assert scale is None or ((scale > 0) & (scale != 1)).all()
 
 
 @pytest.mark.parametrize("normalise", [True, False])
