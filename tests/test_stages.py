@@ -42,6 +42,7 @@ from torchrl_bmrl.pipeline.held_out import COLUMNS, evaluate_held_out
 from torchrl_bmrl.pipeline.learners import Agents
 from torchrl_bmrl.pipeline.stage1 import sizes_of
 from torchrl_bmrl.pipeline.stage2 import advantage_scale, train_student, value_statistics
+from torchrl_bmrl.pipeline.training_data import training_data
 from torchrl_bmrl.tasks import Task, register_task
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
@@ -224,6 +225,27 @@ def test_held_out_numbers_are_those_of_the_demonstrations_and_computed_once(
         _, seen = policies[2 * index + 1]
         for part in (seen, seen["next"]):
             assert (part["task_latent"] == student.prototypes[index]).all()
+
+
+def test_held_out_values_are_compared_in_the_units_that_the_critics_learned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_demonstrations(tmp_path)
+    run = file_run(tmp_path, bcq={"standard_reward": True, "n_steps": 3})
+    monkeypatch.setattr("torchrl_bmrl.pipeline.held_out.estimate_return", lambda *x, **y: 0.0)
+    with run:
+        collect(run)
+        stage1(run)
+        stage2(run)
+        evaluate_held_out(run)
+    rows = read_rows(run.folder / "held_out.csv", COLUMNS)
+    for name, row in zip(run.names, rows, strict=True):
+        parts = [run.transitions(name, split) for split in ("train", "valid")]
+        loss, data = run.teacher(name), training_data(parts, run.settings.bcq)[1]
+        torch.manual_seed(run.seed("held out", name))
+        values = [f(data.copy())[0].item() for f in (loss.generator_loss, loss.qvalue_loss)]
+        assert [row["loss_generator"], row["loss_qvalue"]] == pytest.approx(values, rel=1e-5)
+        assert loss.qvalue_loss(parts[1])[0].item() != pytest.approx(values[1], rel=0.1)
 
 
 def test_held_out_numbers_of_a_run_on_a_device_that_is_not_here_are_refused_by_name(

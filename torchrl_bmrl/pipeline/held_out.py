@@ -16,6 +16,7 @@ from torchrl_bmrl.evaluation.fitted_q import estimate_return
 from torchrl_bmrl.files import finite, read_rows, write_rows
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.pipeline.run import Run
+from torchrl_bmrl.pipeline.training_data import training_data
 from torchrl_bmrl.reports.tables import Table
 from torchrl_bmrl.run.workers import Report
 
@@ -101,12 +102,14 @@ def held_out_job(job: tuple[Run, str], report: Report) -> dict[str, str | float]
 
 def _held_out(run: Run, name: str, report: Report) -> dict[str, str | float]:
     """Computes the numbers of one task."""
-    valid, index = run.transitions(name, "valid"), run.names.index(name)
+    train, valid = (run.transitions(name, split) for split in ("train", "valid"))
+    index, settings = run.names.index(name), run.settings
+    learned = training_data([train, valid], settings.bcq)[1]  # as the critics know it
     loss, (student, metadata) = run.teacher(name), run.student()
     torch.manual_seed(run.seed("held out", name))
     with torch.no_grad(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "No target network updater")  # nothing is trained here
-        generator, qvalue = (f(valid.copy())[0] for f in (loss.generator_loss, loss.qvalue_loss))
+        generator, qvalue = (f(learned.copy())[0] for f in (loss.generator_loss, loss.qvalue_loss))
     teacher = BCQPolicy.frozen(loss, num_candidates=loss.num_candidates)
     policy = student.policy(num_candidates=loss.num_candidates, latent_clip=metadata["latent_clip"])
 
@@ -120,7 +123,6 @@ def _held_out(run: Run, name: str, report: Report) -> dict[str, str | float]:
         each(data.select(*each.in_keys))["action"]
         for each, data in ((teacher, valid), (policy, with_prototype(valid)))
     ]
-    train, settings = run.transitions(name, "train"), run.settings
     options: dict[str, Any] = {
         "updates": _critic_updates(run),
         "gamma": settings.bcq.gamma,

@@ -11,8 +11,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.optim import Adam
+from torchrl.data import ReplayBuffer
 from torchrl.objectives import LossModule, SoftUpdate
 
+from torchrl_bmrl.data.n_step import STEPS_KEY
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.objectives import BCQLoss, StackedLoss
 from torchrl_bmrl.pipeline.agents import make_bcq_loss
@@ -25,7 +27,7 @@ from torchrl_bmrl.training.checkpoint import (
     save_training,
 )
 from torchrl_bmrl.training.health import check_metrics, check_proposals, value_limits
-from torchrl_bmrl.training.update import Update, accelerate, gradient_step, make_adam
+from torchrl_bmrl.training.update import Update, accelerate, decay, gradient_step, make_adam
 
 log = logging.getLogger(__name__)
 
@@ -82,12 +84,13 @@ def make_update(
     return update
 
 
-def choose_updates(
-    run: Run, loss: LossModule, optimizers: dict[str, Adam], targets: SoftUpdate
-) -> Callable[[int], Update]:
-    """Returns a function that maps the number of an update to the update.
+def make_step(
+    run: Run, loss: LossModule, optimizers: dict[str, Adam], targets: SoftUpdate, total: int
+) -> Callable[[int, TensorDictBase], dict[str, Tensor]]:
+    """Returns a function that does the update of a given number on a batch.
 
-    The first ``generator_warmup`` updates train only the generator.
+    The first ``generator_warmup`` updates train only the generator. With ``cosine`` the learning
+    rate decays until update ``total``.
     """
     settings, bcq = run.settings, run.settings.bcq
 
@@ -102,7 +105,14 @@ def choose_updates(
 
     whole = accelerated(*optimizers)
     warm_up = accelerated("generator") if bcq.generator_warmup else whole
-    return lambda number: warm_up if number <= bcq.generator_warmup else whole
+
+    def step(number: int, batch: TensorDictBase) -> dict[str, Tensor]:
+        if bcq.cosine:
+            for optimizer in optimizers.values():
+                decay(optimizer, bcq.lr, number, total)
+        return (warm_up if number <= bcq.generator_warmup else whole)(batch)
+
+    return step
 
 
 class Agents:
@@ -140,6 +150,14 @@ class Agents:
         """Returns an agent's current loss."""
         stacked = isinstance(self.loss, StackedLoss)
         return self.loss.member(self.names.index(name)) if stacked else self.loss
+
+    def make_step(self, total: int) -> Callable[[int, TensorDictBase], dict[str, Tensor]]:
+        """Returns :func:`make_step` of these agents."""
+        return make_step(self.run, self.loss, self.optimizers, self.targets, total)
+
+    def sample(self, buffer: ReplayBuffer) -> TensorDictBase:
+        """Returns a batch of a buffer with what the agents read."""
+        return buffer.sample().select(*self.loss.in_keys, STEPS_KEY, strict=False)
 
     @property
     def healthy(self) -> list[str]:

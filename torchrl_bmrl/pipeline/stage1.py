@@ -15,12 +15,11 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer
 
 from torchrl_bmrl.data import make_multi_task_replay_buffer, make_replay_buffer
-from torchrl_bmrl.data.n_step import STEPS_KEY
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.modules import BCQPolicy, ChunkPolicy
 from torchrl_bmrl.objectives import BCQLoss
-from torchrl_bmrl.pipeline.learners import Agents, choose_updates
+from torchrl_bmrl.pipeline.learners import Agents
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.settings import Settings
 from torchrl_bmrl.pipeline.training_data import training_data
@@ -34,7 +33,7 @@ from torchrl_bmrl.training.diagnostics import (
     write_diagnostics,
 )
 from torchrl_bmrl.training.fit import Every, fit
-from torchrl_bmrl.training.update import decay, keep_freed_memory
+from torchrl_bmrl.training.update import keep_freed_memory
 
 log = logging.getLogger(__name__)
 
@@ -81,13 +80,10 @@ def stage1(run: Run) -> None:
 def train_job(job: tuple[Run, dict[str, str]], report: Report) -> bool:
     """Trains agents (tasks by agent name); returns whether there was something to train."""
     run, agents = job
-    datasets = [
-        part
-        for task in agents.values()
-        for part in training_data([run.transitions(task, "train")], run.settings.bcq)
-    ]
+    bcq = run.settings.bcq
+    datasets = [training_data([run.transitions(x, "train")], bcq)[0] for x in agents.values()]
     options: dict[str, Any] = {
-        "batch_size": run.settings.bcq.batch_size,
+        "batch_size": bcq.batch_size,
         "device": run.settings.device,
     }
     if len(agents) == 1:
@@ -135,7 +131,6 @@ def train_agents(
     total = bcq.epochs * bcq.updates_per_epoch
     unfinished = trained.updates < total
     if unfinished:
-        choose = choose_updates(run, trained.loss, trained.optimizers, trained.targets)
         with ExitStack() as stack:
             loggers = {}
             for name in agents:
@@ -154,12 +149,6 @@ def train_agents(
                 for name, row in trained.check(metrics, batch, update).items():
                     log_metrics(loggers[name] if logging else None, row, update)
 
-            def step(update: int, batch: TensorDictBase) -> dict[str, Tensor]:
-                if bcq.cosine:
-                    for optimizer in trained.optimizers.values():
-                        decay(optimizer, bcq.lr, update, total)
-                return choose(update)(batch)
-
             def end_epoch(update: int) -> None:
                 for name in trained.healthy:
                     _diagnose(run, trained, name, samples[name], loggers[name], update)
@@ -167,8 +156,8 @@ def train_agents(
                     _evaluate_epoch(run, trained, update)
 
             fit(
-                step,
-                lambda: buffer.sample().select(*trained.loss.in_keys, STEPS_KEY, strict=False),
+                trained.make_step(total),
+                lambda: trained.sample(buffer),
                 start=trained.updates,
                 total=total,
                 every=Every(

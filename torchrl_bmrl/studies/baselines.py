@@ -27,7 +27,7 @@ from torchrl_bmrl.modules import BCQPolicy, PrototypeTaskLatent
 from torchrl_bmrl.pipeline.agents import load_bcq_loss, make_bcq_loss
 from torchrl_bmrl.pipeline.evaluate import evaluate_job as evaluate_stages
 from torchrl_bmrl.pipeline.evaluate import evaluate_once
-from torchrl_bmrl.pipeline.learners import choose_updates, loss_options
+from torchrl_bmrl.pipeline.learners import loss_options, make_step
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.stage1 import make_policy, sizes_of
 from torchrl_bmrl.pipeline.training_data import training_data as stage_1_data
@@ -266,8 +266,7 @@ class Learner:
         """
         if self.algorithm == ONE_HOT:
             optimizers = {key.removesuffix("_network"): x for key, x in self.optimizers.items()}
-            choose = choose_updates(self.run, self.loss, optimizers, self.targets)
-            return lambda update, batch: choose(update)(batch)
+            return make_step(self.run, self.loss, optimizers, self.targets, total)
 
         # Never compiled: IQL and CQL do not compile in one piece, and for the others compiling
         # takes longer than it saves.

@@ -15,14 +15,13 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_bmrl.data import make_replay_buffer
-from torchrl_bmrl.data.n_step import STEPS_KEY
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation import rank_correlation
 from torchrl_bmrl.evaluation.fitted_q import estimate_return
 from torchrl_bmrl.files import finite, read_rows, whole, write_rows
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.pipeline.agents import load_bcq_loss
-from torchrl_bmrl.pipeline.learners import Agents, choose_updates
+from torchrl_bmrl.pipeline.learners import Agents
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.stage1 import sizes_of
 from torchrl_bmrl.pipeline.training_data import training_data
@@ -124,7 +123,7 @@ def train_job(job: tuple[Run, tuple[str, list[int]]], report: Report) -> None:
     (data,) = training_data([run.transitions(name, "train")], settings.bcq)
     buffer = make_replay_buffer(data, batch_size=settings.bcq.batch_size, device=settings.device)
     agents = Agents(run, {name: name}, sizes_of(data))
-    choose = choose_updates(run, agents.loss, agents.optimizers, agents.targets)
+    step = agents.make_step(series[-1])
 
     def check(
         update: int, metrics: dict[str, Tensor], batch: TensorDictBase, logging: bool
@@ -139,8 +138,8 @@ def train_job(job: tuple[Run, tuple[str, list[int]]], report: Report) -> None:
 
     for start, end in pairwise([0, *series]):
         fit(
-            lambda update, batch: choose(update)(batch),
-            lambda: buffer.sample().select(*agents.loss.in_keys, STEPS_KEY, strict=False),
+            step,
+            lambda: agents.sample(buffer),
             start=start,
             total=end,
             every=Every(log=end, save=end),
