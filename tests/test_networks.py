@@ -222,3 +222,10 @@ def test_a_network_writes_where_a_tensordict_module_does(inplace: bool | str) ->
     assert set(dropped(data.copy()).keys()) == {"x"}
     with pytest.raises(RuntimeError, match="more out_keys than tensors"):
         Network(linear, in_keys=["x"], out_keys=["y", "z"])(data.copy())
+
+
+def test_an_autoencoder_lists_the_encoder_s_parameters_first() -> None:
+    """In this order the checkpoints of older runs contain the optimizer's state."""
+    names = [name.split(".")[0] for name, _ in ActionVAE(3, 2).named_parameters()]
+    half = len(names) // 2
+    assert names == ["encoder"] * half + ["decoder"] * half

@@ -174,7 +174,8 @@ class Autoencoder(LatentGenerator):
         self, encoder: TensorDictModule, decoder: TensorDictModule, latent_dim: int
     ) -> None:
         super().__init__(decoder, latent_dim)
-        self.encoder = encoder
+        del self.decoder  # first the encoder: checkpoints list the optimizer's state in this order
+        self.encoder, self.decoder = encoder, decoder
         self.in_keys = [key for key in encoder.in_keys if key not in decoder.out_keys]
 
     @property
