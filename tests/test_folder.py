@@ -170,6 +170,26 @@ def test_a_run_takes_from_its_base_what_it_would_only_make_again(
     assert (base / "data" / "reach.hdf5").read_text() == "data/reach.hdf5"
 
 
+def test_a_folder_of_an_earlier_version_has_the_defaults_of_settings_that_it_lacks(
+    tmp_path: Path,
+) -> None:
+    """In the folder itself and in one that is a base."""
+    base, run = tmp_path / "base", tmp_path / "run"
+    open_run(base, SETTINGS | {"collect": {"noise": 0.2}})
+    (base / "data").mkdir()
+    (base / "data" / "reach.hdf5").write_text("episodes")
+    defaults = {"collect": {"noise": 0.1, "speed": 1.0, "absent": 3}, "new": "usual"}
+    now = SETTINGS | {"collect": {"noise": 0.2, "speed": 1.0}, "new": "usual"}
+    open_run(base, now, defaults)
+    open_run(run, now | {"run_dir": str(run), "base": str(base)}, defaults)
+    assert (run / "data" / "reach.hdf5").exists()
+    for other in ({"new": "other"}, {"collect": {"noise": 0.2, "speed": 0.5}}):
+        with pytest.raises(ConfigError, match=r"(new|collect.speed) is .* in the folder's run"):
+            open_run(base, now | other, defaults)
+    with pytest.raises(ConfigError, match=r"collect.speed is 1.0 here and None in"):
+        open_run(base, now)
+
+
 def test_a_run_that_was_killed_while_it_took_files_holds_no_others_when_it_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,6 +21,7 @@ pytest.importorskip("tqdm")
 pytest.importorskip("yaml")
 
 import torch
+import yaml
 from episode_files import make_episode, write_file
 from file_runs import PARTS, TASKS, UPDATES, file_run, write_demonstrations
 
@@ -94,6 +95,25 @@ def test_the_best_agent_is_that_of_the_epoch_with_the_highest_mean_return(traine
         agents.evaluations["door-9"] += [{"epoch": epoch, "return": x} for x in returns]
         agents.save_best("door-9", epoch)
         assert load_checkpoint(path, kind="bcq")[1]["updates"] == best
+
+
+def test_a_run_of_an_earlier_version_goes_on_without_the_settings_that_it_did_not_have(
+    trained: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(trained, folder)
+    path = folder / "config.yaml"
+    settings = yaml.safe_load(path.read_text()) | {"run_dir": str(folder)}
+    for group, name in (("bcq", "acting_rule"), ("distill", "advantage_weight")):
+        del settings[group][name]
+    path.write_text(yaml.safe_dump(settings))
+    run = file_run(trained)  # the demonstrations lie there
+    run.folder = folder
+    with run:
+        stage1(run)
+    run.settings.bcq.acting_rule = "mean"
+    with pytest.raises(ConfigError, match=r"acting_rule is mean here and first in the"), run:
+        stage1(run)
 
 
 # -- stage 2 ---------------------------------------------------------------------------------------

@@ -89,7 +89,8 @@ class Run:
         # Jobs that train only some tasks lock these, so that other jobs can train the rest.
         parts = self.settings.only or ["run", *self.names]
         opened = ExitStack()
-        opened.enter_context(lock_run(self.folder, asdict(self.settings), parts))
+        settings, defaults = asdict(self.settings), asdict(Settings())
+        opened.enter_context(lock_run(self.folder, settings, parts, defaults))
         self._opened = opened
         gc.freeze()  # robosuite collects garbage at every env.close(): leave imported modules out
         return self

@@ -61,7 +61,9 @@ ADOPTED: tuple[tuple[str, tuple[str, ...]], ...] = (
 PACKAGES = ("torchrl", "tensordict", "robosuite", "mujoco", "gymnasium", "numpy", "h5py")
 
 
-def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
+def open_run(
+    run_dir: Path, settings: Mapping[str, Any], defaults: Mapping[str, Any] | None = None
+) -> None:
     """Creates a run folder, or checks that an existing one has the same settings.
 
     Writes ``config.yaml`` (all settings) and ``versions.json``. If the setting ``base`` names the
@@ -71,6 +73,8 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
     Args:
         run_dir: the folder.
         settings: the resolved configuration.
+        defaults: defaults of the settings. A setting that an earlier version did not have counts
+            as its default in that version's folders, since defaults keep their behaviour.
 
     Raises:
         ConfigError: naming the first setting that differs from the folder's run.
@@ -85,10 +89,10 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
         ...
         torchrl_bmrl.errors.ConfigError: ...: seed is 1 here and 0 in the folder's run; ...
     """
-    path = run_dir / "config.yaml"
+    path, now = run_dir / "config.yaml", deciding(settings)
     if not path.exists():
         base = Path(settings["base"]) if settings.get("base") else None
-        theirs = read_settings(base) if base else {}
+        theirs = _settings_of(base, now, defaults) if base else {}
         # torch.__version__ contains the build (2.14.1+cu130); the package's metadata may not.
         versions = {"torch": str(torch.__version__)} | {name: _version(name) for name in PACKAGES}
         versions |= {"torchrl_bmrl": __version__, "python": platform.python_version()}
@@ -98,15 +102,28 @@ def open_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
         write_atomic(path, yaml.safe_dump(dict(settings), sort_keys=False), replace=False)
         if base:  # if killed from here on, the run computes the missing files itself
             for pattern, keys in ADOPTED:
-                if all(theirs.get(key) == settings.get(key) for key in keys):
+                if all(_section(theirs, key) == _section(now, key) for key in keys):
                     for source in base.glob(pattern):
                         target = run_dir / source.relative_to(base)
                         if not target.exists():  # another process may have made it
                             link_or_copy(source, target)
-    before, now = deciding(read_settings(run_dir)), deciding(settings)
+    before = _settings_of(run_dir, now, defaults)
     for key in sorted(before | now):
         if before.get(key) != now.get(key):
             raise other_setting(run_dir, key, now.get(key), before.get(key))
+
+
+def _settings_of(
+    run_dir: Path, now: Mapping[str, Any], defaults: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """Deciding settings of a folder's run; those that its version did not have are the defaults."""
+    before, usual = deciding(read_settings(run_dir)), deciding(defaults or {})
+    return {key: usual[key] for key in now if key in usual and key not in before} | before
+
+
+def _section(named: Mapping[str, Any], section: str) -> dict[str, Any]:
+    """The settings of a section, by dotted names."""
+    return {key: x for key, x in named.items() if key.split(".")[0] == section}
 
 
 def other_setting(run_dir: Path, key: str, now: Any, before: Any) -> ConfigError:

@@ -62,7 +62,10 @@ def lock(folder: Path, names: Sequence[str] = ("run",)) -> Iterator[None]:
 
 @contextlib.contextmanager
 def lock_run(
-    run_dir: Path, settings: Mapping[str, Any], names: Sequence[str] = ("run",)
+    run_dir: Path,
+    settings: Mapping[str, Any],
+    names: Sequence[str] = ("run",),
+    defaults: Mapping[str, Any] | None = None,
 ) -> Iterator[None]:
     """Locks a run folder (:func:`lock`) and opens it (:func:`~torchrl_bmrl.run.folder.open_run`).
 
@@ -73,6 +76,7 @@ def lock_run(
         run_dir: the folder, created if missing.
         settings: the resolved configuration.
         names: names of the parts to lock.
+        defaults: of the settings, see :func:`~torchrl_bmrl.run.folder.open_run`.
 
     Raises:
         BMRLError: the errors of ``lock`` and ``open_run``.
@@ -91,7 +95,7 @@ def lock_run(
     missing = [folder for folder in (run_dir, *run_dir.parents) if not folder.exists()]
     with lock(run_dir, names):
         try:
-            open_run(run_dir, settings)
+            open_run(run_dir, settings, defaults)
             yield
         except Exception:
             ours = {run_dir / name for name in ("config.yaml", "versions.json")}
