@@ -37,7 +37,7 @@ class Normal(TensorDictModuleBase):
 
     metrics, options = (), ()
 
-    def __init__(self, noise: float, scale: float = 1.0) -> None:
+    def __init__(self, noise: float | Tensor, scale: float = 1.0) -> None:
         super().__init__()
         self.in_keys, self.out_keys = ["observation"], ["action"]
         self.noise, self.weight = noise, nn.Parameter(torch.tensor(scale))
@@ -139,6 +139,28 @@ def test_the_gap_is_what_the_first_critic_promises_for_the_best_candidate() -> N
     values = data["observation"][:, 1] + slope * data["action"][:, 0]
     assert found.qvalue_std == pytest.approx(values.std().item(), rel=1e-4)
     assert found.relative_gap == pytest.approx(found.qvalue_gap / found.qvalue_std)
+
+
+@pytest.mark.parametrize("rule", ["mean", "min"])
+def test_actions_are_valued_by_the_rule_that_the_policy_acts_by(rule: str) -> None:
+    slope, data = 5.0, demonstrations()
+    found = diagnose(agent(Normal(NOISE), slope=slope, acting_rule=rule), data)
+    # The critics are s + 5 a and s - 5 a: their mean is s, their minimum s - |5 a|.
+    penalty = slope * data["action"][:, 0].abs() * (rule == "min")
+    values = data["observation"][:, 1] - penalty
+    assert found.qvalue_std == pytest.approx(values.std().item(), rel=1e-4)
+    if rule == "mean":
+        assert found.qvalue_gap == pytest.approx(0.0, abs=1e-5)
+    else:  # the best action is near 0, unless all candidates are far from it
+        assert 0.8 < found.qvalue_gap / penalty.mean().item() < 1.0
+
+
+def test_an_action_far_out_in_a_dimension_of_little_noise_is_outside() -> None:
+    data, noise = demonstrations(2048), torch.tensor([NOISE / 100, NOISE])
+    data["action"] = data["observation"] + noise * torch.randn(2048, 2)
+    wider = noise * torch.tensor([3.0, 1.0])
+    assert diagnose(agent(Normal(wider), slope=1.0), data).outside
+    assert not diagnose(agent(Normal(noise), slope=1.0), data).outside
 
 
 def test_a_wide_generator_and_a_critic_that_prefers_extremes_leave_the_data() -> None:

@@ -23,7 +23,8 @@ from episode_files import write_file
 from helpers import NO_UPDATER
 
 from torchrl_bmrl.pipeline import BCQSettings, EvaluateSettings, Run, Settings, collect, stage1
-from torchrl_bmrl.pipeline.stage1 import train_job
+from torchrl_bmrl.pipeline.learners import Agents
+from torchrl_bmrl.pipeline.stage1 import sizes_of, train_job
 from torchrl_bmrl.training.diagnostics import Diagnostics, diagnose, read_diagnostics
 
 pytestmark = pytest.mark.filterwarnings(NO_UPDATER)
@@ -153,9 +154,37 @@ def test_an_agent_is_diagnosed_on_its_own_demonstrations_as_it_will_act(
     assert torch.equal(calls[0][0]["action"], calls[1][0]["action"])  # comparable between epochs
 
 
-def test_a_run_that_was_stopped_has_the_diagnostics_of_one_that_was_not(
-    collected: Path, tmp_path: Path
+def test_each_agent_of_a_stack_is_diagnosed_itself_on_demonstrations_of_its_own_task(
+    collected: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    calls: list[Any] = []
+
+    def spy(loss: Any, data: Any, **options: Any) -> Diagnostics:
+        calls.append((loss.generator_params.to_tensordict(), data))
+        return diagnose(loss, data, **options)
+
+    monkeypatch.setattr(MODULE, "diagnose", spy)
+    monkeypatch.setattr(MODULE, "DIAGNOSED", 12)
+    folder = trained(collected, tmp_path, stacked=True, seeds=2, epochs=1)
+    run, agents = make(folder, collected), [*TASKS, "door-1", "drawer-1"]
+    for name, (params, data) in zip(agents, calls, strict=True):
+        task = name.removesuffix("-1")
+        own = run.transitions(task, "train")
+        actions = {tuple(x.tolist()) for x in own["action"]}
+        assert {tuple(x.tolist()) for x in data["action"]} <= actions
+        assert (params == run.teacher(name).generator_params.to_tensordict()).all()
+        untrained = Agents(run, {name: task}, sizes_of(own)).loss.generator_params
+        # Three updates change the parameters little; another agent's are quite different.
+        assert ((params - untrained.to_tensordict()).abs() < 0.01).all()
+    # Agents of one task differ in their sample.
+    assert not torch.equal(calls[0][1]["action"], calls[2][1]["action"])
+
+
+def test_a_run_that_was_stopped_has_the_diagnostics_of_one_that_was_not(
+    collected: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(MODULE, "DIAGNOSED", 12)  # fewer than there are: it matters which
+
     class Stop(KeyboardInterrupt):
         pass
 

@@ -230,7 +230,7 @@ def headline(
 
 
 def _successes(summaries: Sequence[Summary], titles: Mapping[str, str]) -> str:
-    """Says how often policies succeeded, and where least often; empty if nothing is known."""
+    """States how often policies succeeded, and where least often; empty if nothing is known."""
     rates = [(s.success_rate, s) for s in summaries if s.success_rate is not None]
     if not rates:
         return ""
@@ -252,7 +252,7 @@ def _draw_embeddings(
     *,
     seed: int,
 ) -> tuple[dict[str, Picture], list[str]]:
-    """Draws the embedding, and says what is left out."""
+    """Draws the embedding, and notes what is left out."""
     if embeddings is None:
         return {}, ["The figures of the embedding are left out: no embeddings were given."]
     embeddings = embeddings.in_time()
@@ -316,7 +316,7 @@ def _measure_embeddings(
     *,
     seed: int,
 ) -> tuple[dict[str, Table], dict[str, Picture], list[str]]:
-    """Measures stages and distances in the embedding, and says what is left out."""
+    """Measures stages and distances in the embedding, and notes what is left out."""
     if embeddings is None or training is None:
         return {}, {}, ["Stages and distances are left out: no training transitions were given."]
     notes, tables, pictures = [], {}, {}

@@ -50,14 +50,14 @@ def read_stage1_curves(run_dir: Path, tasks: Iterable[str]) -> dict[str, Curve]:
 def read_stage1_diagnostics(
     run_dir: Path, titles: Mapping[str, str]
 ) -> dict[str, tuple[int, Diagnostics]]:
-    """Reads the last diagnostics of all agents, for those that have some.
+    """Reads the last diagnostics of every agent that has some.
 
     Args:
         run_dir: Run folder.
         titles: Titles by task.
 
     Returns:
-        Update and diagnostics by the agent's title; a task's further agents have a number.
+        Update and diagnostics by the agent's title; those of a task's further agents are numbered.
 
     Raises:
         DataError: if a file lacks a column, or a value is not valid.
@@ -80,7 +80,7 @@ def read_stage1_diagnostics(
 
 
 def diagnostics_table(diagnosed: Mapping[str, tuple[int, Diagnostics]]) -> Table:
-    """One line per agent: how its candidates vary, and what its critic makes of them.
+    """Returns a table of how each agent's candidates vary and how its critic values them.
 
     Args:
         diagnosed: Update and diagnostics by the agent's title.

@@ -22,7 +22,7 @@ ACTIVE = 0.01
 COLLAPSED = 0.2
 """Candidates with a smaller ``spread_ratio`` have collapsed: the policy clones the data."""
 USUAL = 0.99
-"""Share of the data's actions that are inside the data, by their distance to the mean candidate."""
+"""Share of the data's actions, nearest to the mean candidate first, that count as inside."""
 FEWEST = 10
 """Candidates that are drawn for the spread even if the policy chooses among fewer."""
 OUTSIDE = 0.5
@@ -90,10 +90,10 @@ class Diagnostics:
         return self.outside_share > OUTSIDE
 
     def metrics(self) -> dict[str, float]:
-        """Numbers by name, for a logger; an autoencoder also has its latent's."""
+        """Returns numbers by name for a logger, with those of the latent if there is an encoder."""
         named = {name: x for name, x in vars(self).items() if name != "latent_kl"}
         if self.latent_kl is not None:
-            named["active_latents"] = sum(kl > ACTIVE for kl in self.latent_kl)
+            named["active_latents"] = self.active_latents
             named["largest_latent_kl"] = max(self.latent_kl)
         return named
 
@@ -112,14 +112,15 @@ def diagnose(loss: BCQLoss, data: TensorDictBase, *, num_candidates: int = 100) 
     both have the same expectation.
 
     An action's distance to :math:`\bar a` is the root mean square over its dimensions, each in
-    units of the data's deviation. The plain range of the data's actions would not do instead: it is
-    that of all actions as soon as the demonstrator's noise reaches the bounds.
+    units of the data's deviation. The plain range of the data's actions would not do: once the
+    demonstrator's noise reaches the bounds, it contains every action.
 
     PyTorch's random state is the same after the call as before.
 
     Args:
-        loss: an agent, with any generator. Of a stack: ``stack.member(index)``.
-        data: demonstrations, batch ``[*B]``, with what the loss reads of a state, and the action.
+        loss: an agent, with any generator; for one of a stack, ``stack.member(index)``.
+        data: demonstrations, batch ``[*B]``, with the action and the entries of a state that the
+            loss reads.
         num_candidates: candidates among which the policy chooses.
 
     Example:
@@ -148,13 +149,13 @@ def diagnose(loss: BCQLoss, data: TensorDictBase, *, num_candidates: int = 100) 
         ensemble_value(loss.qvalue(states.copy().set(key, x)), loss.acting_rule)
         for x in (action, chosen)
     )
-    deviation = _rms((action - mean) / half)
-    scale = _rms((action - mean) / half, 0).clamp(min=1e-6) * half
+    error = (action - mean) / half
+    scale = _rms(error, 0).clamp(min=1e-6) * half
     usual, distance = (_rms((x - mean) / scale, -1) for x in (action, chosen))
     distance = distance * ((count + 1) / (count - 1)) ** 0.5  # a chosen action is part of the mean
     return Diagnostics(
         candidate_spread=spread.item(),
-        spread_ratio=(spread / deviation / (count / (count + 1)) ** 0.5).item(),
+        spread_ratio=(spread / _rms(error) / (count / (count + 1)) ** 0.5).item(),
         qvalue_gap=(best - value).mean().item(),
         qvalue_std=value.std().item(),
         outside_share=(distance > usual.quantile(USUAL)).float().mean().item(),
@@ -167,7 +168,7 @@ def _rms(x: Tensor, dim: int | None = None) -> Tensor:
 
 
 def _latent_kl(loss: BCQLoss, data: TensorDictBase) -> tuple[float, ...] | None:
-    """Mean KL divergence of each latent dimension; ``None`` without an encoder."""
+    """Returns the mean KL divergence of each latent dimension; ``None`` without an encoder."""
     if not hasattr(loss.generator, "encode"):
         return None
     keys = loss.tensor_keys
@@ -248,14 +249,11 @@ def collapse_message(found: Mapping[str, Diagnostics]) -> str:
         >>> collapse_message({})
         ''
     """
-    ratios = {name: x.spread_ratio for name, x in found.items() if x.collapsed}
-    if not ratios:
-        return ""
-    return (
-        f"the candidates of {', '.join(ratios)} vary less than the demonstrations (spread_ratio "
-        f"{_span(ratios)}, below {COLLAPSED}), so these policies clone; to improve on the "
-        "demonstrations try bcq.generator=mixture or flow, or a lower bcq.kl_weight and "
-        "bcq.latent_clip=null"
+    return _message(
+        {name: x.spread_ratio for name, x in found.items() if x.collapsed},
+        "the candidates of {names} vary less than the demonstrations (spread_ratio {span}, below "
+        f"{COLLAPSED}), so these policies clone; to improve on the demonstrations try "
+        "bcq.generator=mixture or flow, or a lower bcq.kl_weight and bcq.latent_clip=null",
     )
 
 
@@ -269,18 +267,17 @@ def outside_message(found: Mapping[str, Diagnostics]) -> str:
         >>> outside_message({})
         ''
     """
-    shares = {name: x.outside_share for name, x in found.items() if x.outside}
-    if not shares:
-        return ""
-    return (
-        f"{', '.join(shares)}: most chosen actions are unlike the demonstrations (outside_share "
-        f"{_span(shares)}, above {OUTSIDE}), so the critics may be fooled; try fewer candidates "
-        "(evaluate.num_candidates, bcq.num_candidates) or a narrower generator (a higher "
-        "bcq.kl_weight, bcq.latent_clip=0.5)"
+    return _message(
+        {name: x.outside_share for name, x in found.items() if x.outside},
+        "{names}: most chosen actions are unlike the demonstrations (outside_share {span}, above "
+        f"{OUTSIDE}), so the critics may be fooled; try fewer candidates (evaluate.num_candidates, "
+        "bcq.num_candidates) or a narrower generator (a higher bcq.kl_weight, bcq.latent_clip=0.5)",
     )
 
 
-def _span(values: Mapping[str, float]) -> str:
-    """The smallest and the largest number, or the only one."""
+def _message(values: Mapping[str, float], text: str) -> str:
+    """Fills in the names and the range of their values; empty without names."""
+    if not values:
+        return ""
     low, high = (f"{x:.2f}" for x in (min(values.values()), max(values.values())))
-    return low if low == high else f"{low} to {high}"
+    return text.format(names=", ".join(values), span=low if low == high else f"{low} to {high}")
