@@ -35,8 +35,9 @@ class BCQPolicy(LossPolicy):
     .. math:: \pi(s) = a_{i^*},\quad i^* = \arg\max_i Q_1(s, a_i),\quad
               a_i = G(s, z_i) + \phi\, h\, \xi(s, G(s, z_i))
 
-    with :math:`h` half the action's range. Reference: *Compositional Skill Learning Using Batch
-    Meta RL*, eq. 2, section 7.1.
+    with :math:`h` half the action's range. A loss with another ``acting_rule`` than ``"first"``
+    gives the policy an :class:`EnsembleCritic` in place of :math:`Q_1`. Reference: *Compositional
+    Skill Learning Using Batch Meta RL*, eq. 2, section 7.1.
 
     It is used in stage 1 and stage 2: if the generator and the critic read ``task_latent``, so does
     the policy. Proposals are drawn from PyTorch's global generator at every call, whatever the
