@@ -15,8 +15,8 @@ import pytest
 for extra in ("scipy", "matplotlib", "jinja2", "sklearn"):
     pytest.importorskip(extra)
 
-from published_data import DOCS, cells, make_published, make_run
-from weak_data import ARMS, Arm, make_weak, make_weak_rows
+from published_data import DOCS, Arm, cells, make_published, make_run
+from weak_data import ARMS, make_weak, make_weak_rows
 
 # isort: split
 from published import TASKS, Published, write_published

@@ -95,11 +95,7 @@ def _evaluated(published: Published, change: Change) -> list[ResultRow]:
 
 
 def _rolled_out(curves: Sequence[CurveRow], change: Change) -> list[ResultRow]:
-    """Returns the rollouts after the last epoch of each agent as episodes of BCQ."""
-    mine = [curve for curve in curves if curve.key[:2] == change]
-    last: dict[tuple[str, int], int] = {}
-    for c in mine:
-        last[c.task, c.seed] = max(c.epoch, last.get((c.task, c.seed), 0))
+    """Returns the rollouts of a change, all after the last epoch, as episodes of BCQ."""
     return [
         ResultRow(
             task=c.task,
@@ -109,8 +105,8 @@ def _rolled_out(curves: Sequence[CurveRow], change: Change) -> list[ResultRow]:
             episode_return=c.episode_return,
             success=c.success,
         )
-        for c in mine
-        if c.epoch == last[c.task, c.seed]
+        for c in curves
+        if c.key[:2] == change
     ]
 
 
