@@ -12,11 +12,11 @@ import numpy as np
 DOCS = Path(__file__).parents[1] / "docs"
 sys.path.append(str(DOCS / "results"))
 
+from comparisons import Arm  # noqa: E402
 from published import TASKS, CurveRow, Published, RunRow  # noqa: E402
 
 from torchrl_bmrl.evaluation import ResultRow  # noqa: E402
 
-Arm = tuple[str, str]
 ARMS: Mapping[Arm, float] = {
     ("expert", ""): 1.0,
     ("bcq", ""): 1.02,

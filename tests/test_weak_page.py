@@ -63,7 +63,7 @@ def returns(rows: list[ResultRow], arm: Arm, task: str) -> np.ndarray:
     return np.array([r.episode_return for r in sorted(mine, key=lambda r: (r.seed, r.episode))])
 
 
-# What was asked for
+# Targets
 
 
 def test_everything_that_was_asked_for_can_be_met() -> None:
@@ -206,7 +206,7 @@ def test_a_missed_target_is_named_in_short() -> None:
 
 
 def test_ablations_of_stage_1_alone_are_read_from_the_last_rollouts(page: str) -> None:
-    lines = cells(page, "One setting of stage 1 changed")
+    lines = cells(page, "Presets with and without a change")
     found = [(line["Preset"], line["Change"], line["Seeds"], line["Episodes"]) for line in lines]
     assert found == [("weak", "none", "0, 1", "2"), ("weak", "dim4", "0", "2")]
     for line, mean, rate in zip(lines, (300.0, 150.0), (100, 0), strict=True):
@@ -247,10 +247,10 @@ def test_sections_without_data_are_left_out(page: str) -> None:
         "In short",
         "Every policy and task",
         "Paired differences",
-        "What each step bought",
+        "Ablations of stage 1",
         "Diagnostics of stage 1",
-        "How long it took",
-        "Again",
+        "Running times",
+        "How to reproduce the runs",
         "Everything measured",
     ]
     assert "`recipes/train_bcq.py` needs the demonstrations" in page
@@ -259,8 +259,8 @@ def test_sections_without_data_are_left_out(page: str) -> None:
     assert headings(little) == [
         "In short",
         "Every policy and task",
-        "How long it took",
-        "Again",
+        "Running times",
+        "How to reproduce the runs",
         "Everything measured",
     ]
     assert "train_bcq" not in little
