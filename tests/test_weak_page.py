@@ -123,6 +123,16 @@ def test_a_mean_difference_whose_interval_contains_zero_is_not_met() -> None:
     assert {what for what, line in lines.items() if line["Met"] == "no"} == {LINES[9]}
 
 
+def test_a_task_that_is_significantly_below_counts_beside_one_with_a_wider_interval() -> None:
+    rows = [row for row in make_weak_rows() if row.policy != "iql"]
+    for row in [row for row in rows if row.policy == "bcq"]:
+        more = {"reach": 1.0, "lift": 40.0 * (-1) ** row.episode}.get(row.task, -10.0)
+        rows.append(replace(row, policy="iql", episode_return=row.episode_return + more))
+    line = lines_of(rows)[LINES[12]]
+    assert line["Met"] == "no"
+    assert line["Measured"].endswith("(Reach)")
+
+
 @pytest.mark.parametrize(("share", "met"), [(1.47, "yes"), (1.43, "no")])
 def test_where_the_ratio_is_out_of_reach_the_distance_to_the_optimum_counts(
     share: float, met: str
