@@ -273,6 +273,10 @@ def test_sections_without_data_are_left_out(page: str) -> None:
         "How to reproduce the runs",
         "Everything measured",
     ]
+    assert "### Targets" in little
+    experts = [row for row in rows if row.policy == "expert"]
+    least = make_weak_page(Published().with_run(make_run("weak_paper"), experts, [])).text
+    assert "### Targets" not in least
     assert "train_bcq" not in little
     assert "baselines.py" not in little
 
