@@ -6,7 +6,7 @@
 #        MultiAction count the steps that were done.
 # Seen:  stack_rewards=False, which returns the last reward, returns 0: the skipped rest of the chunk
 #        counts as the last step. An episode with its only reward at its end has none, unless its
-#        length is a multiple of the chunk's. On a SerialEnv of which another environment goes on,
+#        length is a multiple of the chunk's. On a SerialEnv whose other environment goes on,
 #        stack_rewards=True repeats the reward for each skipped step, [0, 1, 1, 1], where a single
 #        environment gives [0, 1, 0]. RewardSum and StepCounter below MultiAction count the skipped
 #        steps, too: 3 and 8 instead of 1 and 6. No warning.

@@ -361,9 +361,10 @@ def test_weak_presets_have_the_speed_limits_and_the_noise_that_the_docs_explain(
         assert (lift.noise, lift.gains.speed_limit) == (0.4, 0.35)
         assert lift.gains.contact_speed_limit == 0.3
     mixed = settings_of("preset=mixed", f"run_dir={tmp_path}").collect
-    assert [each.noise for each in mixed.experts_of("push_up")] == [0.2, 0.2, 0.5]
-    limits = [each.gains.speed_limit for each in mixed.experts_of("push_up")]
-    assert limits == [1.0, 0.35, 1.0]
+    for task in ("reach", "push_up"):
+        assert [each.noise for each in mixed.experts_of(task)] == [0.2, 0.2, 0.5]
+        limits = [each.gains.speed_limit for each in mixed.experts_of(task)]
+        assert limits == [1.0, 0.35, 1.0]
 
 
 def test_a_command_line_gives_the_experts_of_a_task(recipes: Any, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ for extra in ("scipy", "matplotlib", "jinja2", "sklearn"):
     pytest.importorskip(extra)
 
 from published_data import make_curves, make_published, make_rows, make_run
+from weak_data import make_agents, make_weak, make_weak_rows
 
 # isort: split
 from published import EpisodeRow, Published, read_curve_rows, read_published, write_published
@@ -75,6 +76,30 @@ def test_a_run_replaces_its_rows_and_no_others() -> None:
     ]
     assert [c for c in again.curves if c.seed == 2] == make_curves(2, epochs=1)
     assert [c for c in again.curves if c.seed == 1] == make_curves(1)
+
+
+def test_the_diagnostics_of_a_run_replace_those_of_the_same_run_alone() -> None:
+    published = make_weak()
+    new = [replace(make_agents("weak_paper", "none", 2)[0], spread_ratio=0.5)]
+    again = published.with_run(make_run("weak_paper", seed=2), make_weak_rows(2), [], new)
+    others = [d for d in published.diagnostics if d.seed != 2]
+    assert others
+    assert list(again.diagnostics) == others + new
+
+
+def test_diagnostics_are_read_back_and_refused_twice_or_without_a_run(tmp_path: Path) -> None:
+    write_published(tmp_path, make_weak())
+    assert set(read_published(tmp_path).diagnostics) == set(make_weak().diagnostics)
+    path = tmp_path / "diagnostics.csv"
+    text = path.read_text()
+    first = text.splitlines()[1]
+    for line, says in (
+        (first, r"diagnostics.csv: line 12 repeats line 2"),
+        (first.replace("none,1", "none,7"), r"'weak_paper', 'none', 7.* not in runs"),
+    ):
+        path.write_text(f"{text}{line}\n")
+        with pytest.raises(DataError, match=says):
+            read_published(tmp_path)
 
 
 def test_curves_are_kept_of_the_paper_s_runs_alone() -> None:

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-import numpy as np
-from published_data import make_curves, make_run
+from published_data import Arm, make_curves, make_rows, make_run
 
 # isort: split
 from published import TASKS, DiagnosticsRow, Published
 
 from torchrl_bmrl.evaluation import ResultRow
 
-Arm = tuple[str, str]
 ARMS: Mapping[Arm, float] = {
     ("expert", ""): 1.0,
     ("reference", ""): 2.0,
@@ -41,27 +39,8 @@ def make_weak_rows(
         failures: number of failed episodes by policy and task.
         episodes: episodes of each policy and task.
     """
-    rng = np.random.default_rng(seed)
-    rows = []
-    for index, task in enumerate(TASKS):
-        starts = rng.normal(100.0 + 20.0 * index, 3.0, episodes)
-        for arm, usual in ARMS.items():
-            share = (shares or {}).get((arm, task), usual)
-            failed = (failures or {}).get((arm, task), 0)
-            returns = share * starts + rng.normal(0.0, 0.5, episodes)
-            rows += [
-                ResultRow(
-                    task=task,
-                    policy=arm[0],
-                    latent_source=arm[1],
-                    seed=seed,
-                    episode=episode,
-                    episode_return=round(float(value), 3),
-                    success=episode >= failed,
-                )
-                for episode, value in enumerate(returns)
-            ]
-    return rows
+    failures = failures or {}
+    return make_rows(seed, episodes=episodes, arms=ARMS, shares=shares, failures=failures)
 
 
 def make_agents(preset: str, ablation: str, seed: int) -> list[DiagnosticsRow]:

@@ -1,4 +1,4 @@
-"""What the pages of results share: writing and checking a page, and the section on its runs."""
+"""Parts that both pages of results share: writing and checking a page, and common sections."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 
+import numpy as np
+from comparisons import seeds_table
 from published import RunRow
 
 from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.evaluation.results import ResultRow, Summary
 from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.reports import Section, task_titles
 from torchrl_bmrl.reports.paper import TABLE_1
+from torchrl_bmrl.reports.report import headline
 from torchrl_bmrl.reports.tables import MISSING, Table
 
 CURVES = "images/results_curves.png"
@@ -69,6 +73,44 @@ def check_page(path: Path, page: Page) -> None:
         raise DataError(picture, None, f"no such picture; {again}")
 
 
+def in_short(
+    runs: Sequence[RunRow],
+    rows: Sequence[ResultRow],
+    summaries: Sequence[Summary],
+    targets: Table,
+    *,
+    source: str,
+    paragraphs: Sequence[str] = (),
+) -> Section:
+    """Summarises the main runs of a page.
+
+    Args:
+        runs: the main runs.
+        rows: their evaluated episodes.
+        summaries: the means of these episodes.
+        targets: table of targets, left out if it is empty.
+        source: source of m of the distilled policy in the text.
+        paragraphs: further paragraphs, shown after the first one.
+    """
+    seeds = ", ".join(str(seed) for seed in sorted({row.seed for row in rows}))
+    accuracies = [run.accuracy for run in runs if run.accuracy is not None]
+    accuracy = float(np.mean(accuracies)) if accuracies else None
+    return Section(
+        heading="In short",
+        paragraphs=[
+            f"Preset `{runs[0].preset}`, training seeds {seeds}; {len(rows):,} evaluated episodes.",
+            *paragraphs,
+            *headline(summaries, default_source=source, accuracy=accuracy),
+        ],
+        tables=[*([targets] if targets.rows else []), seeds_table(rows, runs)],
+    )
+
+
+def table_section(heading: str, table: Table) -> list[Section]:
+    """Returns a section with one table; none if the table is empty."""
+    return [Section(heading=heading, tables=[table])] if table.rows else []
+
+
 def runs_sections(runs: Sequence[RunRow], *, baselines: bool, note: str = "") -> list[Section]:
     """Lists the times, commands and versions of all runs.
 
@@ -79,17 +121,19 @@ def runs_sections(runs: Sequence[RunRow], *, baselines: bool, note: str = "") ->
     """
     if not runs:
         return []
-    more = " The other algorithms: the same settings with `recipes/baselines.py`, afterwards."
+    more = " `recipes/baselines.py` with the same settings then trains the other algorithms."
     versions: dict[str, list[str]] = {}
     for run in runs:
         commit = f"commit {run.commit}, " if run.commit else ""
         versions.setdefault(f"{commit}{run.versions}", []).append("/".join(map(str, run.key)))
     return [
-        Section(heading="How long it took", tables=[_clock_table(runs)]),
+        Section(heading="Running times", tables=[_clock_table(runs)]),
         Section(
-            heading="Again",
+            heading="How to reproduce the runs",
             paragraphs=[
-                "The same runs, and then this page from their folders." + more * baselines + note,
+                "These commands make the same runs, and then this page from their folders."
+                + more * baselines
+                + note,
                 "\n".join(
                     [
                         "```bash",
@@ -115,9 +159,9 @@ def _clock_table(runs: Sequence[RunRow]) -> Table:
     return Table(
         title="Minutes of each stage",
         caption=(
-            "Wall-clock minutes, summed over interruptions, with what else the machine did at the "
-            "time. A run with a change may take over what it would only make again from the run "
-            "without it. Workers: processes side by side, one thread each."
+            "Wall-clock minutes, summed over interruptions. Other work on the machine may have "
+            "made a stage slower. A run with a change may link files of the run without it instead "
+            "of computing them again. Workers: processes side by side, one thread each."
         ),
         header=(
             "Preset",

@@ -38,12 +38,23 @@ Key = tuple[str, str, int]
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunRow:
-    """A finished run; a time [s] is ``None`` if it was not measured, or its stage was not run."""
+class _RowOfRun:
+    """The first columns of a row that belongs to a run."""
 
     preset: str
     ablation: str
     seed: int
+
+    @property
+    def key(self) -> Key:
+        """Preset, ablation and seed of the run."""
+        return self.preset, self.ablation, self.seed
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunRow(_RowOfRun):
+    """A finished run; a time [s] is ``None`` if it was not measured, or its stage was not run."""
+
     command: str  # runs it again
     commit: str  # of the code; empty if unknown
     versions: str
@@ -55,11 +66,6 @@ class RunRow:
     seconds_evaluate: float | None
     device: str
     workers: int
-
-    @property
-    def key(self) -> Key:
-        """Preset, ablation and seed."""
-        return self.preset, self.ablation, self.seed
 
     @property
     def evaluated(self) -> bool:
@@ -82,42 +88,26 @@ class EpisodeRow:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CurveRow:
+class CurveRow(_RowOfRun):
     """A rollout of a BCQ policy after an epoch of its training."""
 
-    preset: str
-    ablation: str
     task: str
-    seed: int
     epoch: int
     update: int
     episode: int
     episode_return: float
     success: bool
 
-    @property
-    def key(self) -> Key:
-        """Preset, ablation and seed of the run."""
-        return self.preset, self.ablation, self.seed
-
 
 @dataclass(frozen=True, kw_only=True)
-class DiagnosticsRow:
+class DiagnosticsRow(_RowOfRun):
     """The last diagnostics of a task's agent; the gap is ``None`` if it is not defined."""
 
-    preset: str
-    ablation: str
     task: str
-    seed: int
     update: int
     spread_ratio: float
     relative_gap: float | None
     outside_share: float
-
-    @property
-    def key(self) -> Key:
-        """Preset, ablation and seed of the run."""
-        return self.preset, self.ablation, self.seed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,11 +288,10 @@ def _optional(text: str) -> float | None:
     return finite(text) if text else None
 
 
+_RUN: Mapping[str, Callable[[str], Any]] = {"preset": name, "ablation": name, "seed": whole}
 _CURVES: Mapping[str, Callable[[str], Any]] = {
-    "preset": name,
-    "ablation": name,
+    **_RUN,
     "task": one_of(*TASKS),
-    "seed": whole,
     "epoch": whole,
     "update": whole,
     "episode": whole,
@@ -310,19 +299,15 @@ _CURVES: Mapping[str, Callable[[str], Any]] = {
     "success": flag,
 }
 _DIAGNOSTICS: Mapping[str, Callable[[str], Any]] = {
-    "preset": name,
-    "ablation": name,
+    **_RUN,
     "task": one_of(*TASKS),
-    "seed": whole,
     "update": whole,
     "spread_ratio": finite,
     "relative_gap": _optional,
     "outside_share": finite,
 }
 _RUNS: Mapping[str, Callable[[str], Any]] = {
-    "preset": name,
-    "ablation": name,
-    "seed": whole,
+    **_RUN,
     "command": str,
     "commit": str,
     "versions": str,

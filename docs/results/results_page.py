@@ -1,4 +1,4 @@
-"""The results page in Markdown, computed from the three CSV files alone."""
+"""The results page in Markdown, computed from the CSV files of its runs alone."""
 
 from __future__ import annotations
 
@@ -18,10 +18,19 @@ from comparisons import (
     differences_table,
     gains_table,
     policies_table,
-    seeds_table,
     spread_table,
 )
-from pages import TITLES, Page, check_page, make_page, prose, runs_sections, write_page
+from pages import (
+    TITLES,
+    Page,
+    check_page,
+    in_short,
+    make_page,
+    prose,
+    runs_sections,
+    table_section,
+    write_page,
+)
 from published import (
     MAIN,
     TASKS,
@@ -35,7 +44,6 @@ from targets import targets_table
 from torchrl_bmrl.evaluation.results import ResultRow, Summary, summarise
 from torchrl_bmrl.reports import Picture, Section, paper, results_table, stage1_curves
 from torchrl_bmrl.reports.figures import Curve
-from torchrl_bmrl.reports.report import headline
 from torchrl_bmrl.reports.tables import policy_name
 
 
@@ -47,13 +55,13 @@ def make_results_page(published: Published) -> Page:
     summaries = summarise(rows, TASKS)
     sections = [
         *_main_sections(rows, summaries, runs, curves),
-        *_ablations(published),
+        *table_section("Ablations", ablations_table(published.episodes, published.runs)),
         *runs_sections(published.runs, baselines=bool(baselines_of(rows))),
         Section(heading="Why returns differ from the paper's", paragraphs=[prose("returns")]),
         Section(heading="What was tried", paragraphs=[prose("tried")]),
     ]
     if summaries:
-        sections.append(Section(heading="Everything measured", tables=[results_table(summaries)]))
+        sections += table_section("Everything measured", results_table(summaries))
     return make_page(prose("head"), sections)
 
 
@@ -84,24 +92,10 @@ def _main_sections(
     """Sections on the runs with the paper's sizes."""
     if not rows:
         return []
-    accuracies = [run.accuracy for run in runs if run.accuracy is not None]
-    seeds = ", ".join(str(seed) for seed in sorted({row.seed for row in rows}))
-    episodes = len(rows)
     targets = targets_table(rows, summaries, runs)
     drawn = _curves(curves)
     sections = [
-        Section(
-            heading="In short",
-            paragraphs=[
-                f"Preset `{MAIN[0]}`, training seeds {seeds}; {episodes:,} evaluated episodes.",
-                *headline(
-                    summaries,
-                    default_source=DEFAULT_SOURCE,
-                    accuracy=float(np.mean(accuracies)) if accuracies else None,
-                ),
-            ],
-            tables=[*([targets] if targets.rows else []), seeds_table(rows, runs)],
-        ),
+        in_short(runs, rows, summaries, targets, source=DEFAULT_SOURCE),
         Section(
             heading="The paper's tables",
             tables=[
@@ -119,17 +113,12 @@ def _main_sections(
                 ),
             ],
         ),
-        _over_the_expert(rows),
+        *table_section("Over the expert", differences_table(rows, [BCQ, DISTILLED])),
         _sources(rows, summaries),
         _figure_3(drawn, summaries),
         _stages(rows, summaries),
     ]
     return [section for section in sections if section.tables or section.paragraphs]
-
-
-def _over_the_expert(rows: Sequence[ResultRow]) -> Section:
-    table = differences_table(rows, [BCQ, DISTILLED])
-    return Section(heading="Over the expert", tables=[table] if table.rows else [])
 
 
 def _sources(rows: Sequence[ResultRow], summaries: Sequence[Summary]) -> Section:
@@ -223,8 +212,3 @@ def _stages(rows: Sequence[ResultRow], summaries: Sequence[Summary]) -> Section:
             *([gains] if gains.rows else []),
         ],
     )
-
-
-def _ablations(published: Published) -> list[Section]:
-    table = ablations_table(published.episodes, published.runs)
-    return [Section(heading="Ablations", tables=[table])] if table.rows else []

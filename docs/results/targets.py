@@ -83,10 +83,10 @@ def targets_table(
         asked, measured = f"at least {paper.ACCURACY:.0%}", f"{accuracy:.1%} (seed {seed})"
         lines.append(target(what, asked, measured, accuracy >= paper.ACCURACY))
     return Table(
-        title="What was asked for",
+        title="Targets",
         caption=(
-            "Each number is that of the task, or of the seed, that fares worst; the interval "
-            f"beside it is that task's. Distilled: with the default source of m, {DEFAULT_SOURCE}."
+            "Each number is that of the worst task or seed, with the interval of that task. "
+            f"Distilled: with the default source of m, {DEFAULT_SOURCE}."
         ),
         header=("What", "Asked", "Measured", "Met"),
         rows=lines,
@@ -104,15 +104,16 @@ def weak_targets_table(rows: Sequence[ResultRow], summaries: Sequence[Summary]) 
     for arm in CLONES:
         lines += _paired_targets(rows, arm)
     return Table(
-        title="What was asked for",
+        title="Targets",
         caption=(
             "BCQ over the expert: the paper's ratio of returns. Where this multiple of the "
             "expert's return exceeds the scripted optimum's, the target is a share of the distance "
             "from the expert's return to the scripted optimum's; the interval resamples the starts "
-            "of all three. Success and the distilled policy's share: of the task that fares worst, "
-            "with that task's interval. Distilled: with one source of m for all tasks, the one "
-            "whose worst share of BCQ's return is highest. Paired differences: on the same starts, "
-            "as a share of the expert's return. Significantly below: the whole interval is below 0."
+            "of all three. Success and the distilled policy's share: those of the worst task, with "
+            "that task's interval. Distilled: with the source of m whose worst share of BCQ's "
+            "return is highest, the same for all tasks. Paired differences are on the same starts, "
+            "as shares of the expert's return. Significantly below means that the whole interval "
+            "is below 0."
         ),
         header=("What", "Asked", "Measured", "Met"),
         rows=lines,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 from comparisons import (
     BCQ,
     DEFAULT_SOURCE,
@@ -14,17 +13,25 @@ from comparisons import (
     baselines_of,
     difference,
     differences,
-    seeds_table,
     share,
 )
-from pages import TITLES, Page, check_page, make_page, prose, runs_sections, write_page
+from pages import (
+    TITLES,
+    Page,
+    check_page,
+    in_short,
+    make_page,
+    prose,
+    runs_sections,
+    table_section,
+    write_page,
+)
 from published import TASKS, WEAK, Published, RunRow, read_published
 from targets import best_source, weak_targets_table
 from weak_tables import agents_table, returns_table, steps_table
 
 from torchrl_bmrl.evaluation.results import ResultRow, Summary, summarise
 from torchrl_bmrl.reports import Section, results_table, task_name
-from torchrl_bmrl.reports.report import headline
 from torchrl_bmrl.reports.tables import Table
 from torchrl_bmrl.studies.baselines_report import make_paired_table
 
@@ -43,14 +50,14 @@ def make_weak_page(published: Published) -> Page:
     alone = not all(run.evaluated for run in published.runs)
     sections = [
         *_main_sections(rows, summaries, runs),
-        *_section("What each step bought", steps),
-        *_section("Diagnostics of stage 1", agents),
+        *table_section("Ablations of stage 1", steps),
+        *table_section("Diagnostics of stage 1", agents),
         *runs_sections(
             published.runs, baselines=bool(baselines_of(rows)), note=NOTE if alone else ""
         ),
     ]
     if summaries:
-        sections += _section("Everything measured", results_table(summaries))
+        sections += table_section("Everything measured", results_table(summaries))
     return make_page(prose("weak_head"), sections)
 
 
@@ -85,25 +92,18 @@ def _main_sections(
     if not rows:
         return []
     targets = weak_targets_table(rows, summaries)
-    seeds = ", ".join(str(seed) for seed in sorted({row.seed for row in rows}))
-    accuracies = [run.accuracy for run in runs if run.accuracy is not None]
     source = best_source(rows)
     return [
-        Section(
-            heading="In short",
-            paragraphs=[
-                f"Preset `{WEAK[0]}`, training seeds {seeds}; {len(rows):,} evaluated episodes.",
-                *_short(rows, targets),
-                *headline(
-                    summaries,
-                    default_source=source[1] if source else DEFAULT_SOURCE,
-                    accuracy=float(np.mean(accuracies)) if accuracies else None,
-                ),
-            ],
-            tables=[*([targets] if targets.rows else []), seeds_table(rows, runs)],
+        in_short(
+            runs,
+            rows,
+            summaries,
+            targets,
+            source=source[1] if source else DEFAULT_SOURCE,
+            paragraphs=_short(rows, targets),
         ),
         Section(heading="Every policy and task", tables=[returns_table(rows, TITLES)]),
-        *_section("Paired differences", make_paired_table(rows, TITLES)),
+        *table_section("Paired differences", make_paired_table(rows, TITLES)),
     ]
 
 
@@ -124,7 +124,3 @@ def _short(rows: Sequence[ResultRow], targets: Table) -> list[str]:
         met = f"{len(targets.rows) - len(missed)} of {len(targets.rows)} targets are met"
         sentences.append(f"{met}; not met: {'; '.join(missed)}." if missed else f"{met}.")
     return [" ".join(sentences)] if sentences else []
-
-
-def _section(heading: str, table: Table) -> list[Section]:
-    return [Section(heading=heading, tables=[table])] if table.rows else []

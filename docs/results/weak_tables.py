@@ -26,14 +26,15 @@ def returns_table(rows: Sequence[ResultRow], titles: dict[str, str]) -> Table:
             "Mean return over an episode, and success, on the same starts. Expert: the weak "
             "expert, which acts as it demonstrates. Scripted optimum: the same controller without "
             "noise and with default gains. Distilled: with the source of m in brackets. All "
-            "others learn from the same demonstrations; ReBRAC, BC and BCQ with a one-hot task as "
-            "in [baselines.md](baselines.md). Interval: bootstrap over the episodes of each task."
+            "policies but these experts learn from the same demonstrations. "
+            "[baselines.md](baselines.md) describes the other algorithms. Interval: bootstrap over "
+            "the episodes of each task."
         ),
     )
 
 
 def steps_table(published: Published) -> Table:
-    """Stage 1 with one setting changed, beside the runs of the same preset without the change."""
+    """Compares ablations of stage 1 with the runs of the same preset without an ablation."""
     lines, starts = [], {}
     for preset in WEAK_PRESETS:
         changes = list(dict.fromkeys(r.key[:2] for r in published.runs if r.preset == preset))
@@ -51,9 +52,9 @@ def steps_table(published: Published) -> Table:
         lines += [_step(change, rows, base) for change, rows in found.items() if rows]
     kinds = "; ".join(f"for preset {preset}, {kind}" for preset, kind in starts.items())
     return Table(
-        title="One setting of stage 1 changed",
+        title="Presets with and without a change",
         caption=(
-            "Each line but “none” changes one setting of the preset (`recipes/config/ablation`). "
+            "Each line but “none” is an ablation of the preset (`recipes/config/ablation`). "
             "Cells: mean return of BCQ and success. Share: mean over tasks of the mean return as a "
             "share of that without the change, on the same starts and seeds, with a 95% interval "
             "from episodes resampled in pairs within each task and seed. Starts, which no "
@@ -95,11 +96,7 @@ def _evaluated(published: Published, change: Change) -> list[ResultRow]:
 
 
 def _rolled_out(curves: Sequence[CurveRow], change: Change) -> list[ResultRow]:
-    """Returns the rollouts after the last epoch of each agent as episodes of BCQ."""
-    mine = [curve for curve in curves if curve.key[:2] == change]
-    last: dict[tuple[str, int], int] = {}
-    for c in mine:
-        last[c.task, c.seed] = max(c.epoch, last.get((c.task, c.seed), 0))
+    """Returns the rollouts of a change, all after the last epoch, as episodes of BCQ."""
     return [
         ResultRow(
             task=c.task,
@@ -109,8 +106,8 @@ def _rolled_out(curves: Sequence[CurveRow], change: Change) -> list[ResultRow]:
             episode_return=c.episode_return,
             success=c.success,
         )
-        for c in mine
-        if c.epoch == last[c.task, c.seed]
+        for c in curves
+        if c.key[:2] == change
     ]
 
 

@@ -71,7 +71,7 @@ def policies(num_candidates: int, device: str = "cpu") -> dict[str, BCQPolicy]:
         )
         for note, options in (
             ("", {}),
-            (", minimum of 4 critics", {"num_qvalue_nets": 4, "acting_rule": "min"}),
+            (", mean of 4 critics", {"num_qvalue_nets": 4, "acting_rule": "mean"}),
         )
         for name in GENERATORS
     }

@@ -74,10 +74,9 @@ def _change(plain: ExpertSettings, entry: Mapping[str, float], name: str) -> Exp
         if not isinstance(value, int | float) or not math.isfinite(value):
             raise ConfigError(f"{name}.{key} is {value!r}; valid: a number")
     changes = dict(entry)
-    expert = dataclasses.replace(plain, noise=changes.pop("noise", plain.noise))
+    noise, gains = changes.pop("noise", plain.noise), plain.gains
+    check_settings(ExpertSettings(noise=noise), f"{name}.")
     if changes:
-        gains = dataclasses.replace(plain.gains or ExpertGains(), **changes)  # type: ignore[arg-type]
+        gains = dataclasses.replace(gains or ExpertGains(), **changes)  # type: ignore[arg-type]
         check_settings(gains, f"{name}.")
-        expert = dataclasses.replace(expert, gains=gains)
-    check_settings(dataclasses.replace(expert, gains=None), f"{name}.")
-    return expert
+    return ExpertSettings(noise=noise, gains=gains)
