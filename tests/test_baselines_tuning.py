@@ -21,6 +21,7 @@ pytest.importorskip("tqdm")
 from small_runs import TASKS, command_line, contents, started, study_run
 from small_runs import make_run as small_run
 from tensordict import TensorDict
+from torchrl.envs import ExplorationType, exploration_type
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.evaluation import read_results
@@ -37,6 +38,7 @@ from torchrl_bmrl.studies.baselines import (
     BaselineSettings,
     Learner,
     baselines,
+    evaluate_job,
     has_agents,
     make_buffer,
     train_job,
@@ -281,6 +283,16 @@ def test_a_baseline_has_the_layer_norm_of_the_run_and_its_own_coefficients(
 
     assert metrics(**published(algorithm)) == metrics()
     assert metrics(**given) != metrics()
+
+
+def test_baselines_act_without_noise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, seen = fake_run(tmp_path, monkeypatch), []
+    monkeypatch.setattr(
+        "torchrl_bmrl.studies.baselines.evaluate_once", lambda *args, **_: args[3]([0])
+    )
+    monkeypatch.setattr(Run, "play", lambda *_, **__: seen.append(exploration_type()) or [])
+    evaluate_job((run, ("iql", "lift", {}, False)), lambda _: None)
+    assert seen == [ExplorationType.DETERMINISTIC]
 
 
 # -- whole runs ------------------------------------------------------------------------------------
