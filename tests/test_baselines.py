@@ -63,11 +63,9 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def make_learner(
-    folder: Path, algorithm: str, coefficients: dict[str, float] | None = None, **bcq: Any
-) -> Learner:
+def make_learner(folder: Path, algorithm: str, **bcq: Any) -> Learner:
     task = ALL_TASKS if algorithm == "bcq_one_hot" else "lift"
-    return Learner(make_run(folder, **bcq), algorithm, task, coefficients)
+    return Learner(make_run(folder, **bcq), algorithm, task, {})
 
 
 ACTION = torch.linspace(-0.6, 0.6, ACTION_DIM)
@@ -206,6 +204,17 @@ def test_the_discount_is_that_of_stage_1(collected: Path, algorithm: str) -> Non
     assert learner.loss.value_estimator.gamma.item() == 0.5
 
 
+@pytest.mark.parametrize("cosine", [True, False])
+@pytest.mark.parametrize("algorithm", BASELINES)
+def test_the_learning_rate_of_every_network_decays_if_that_of_stage_1_does(
+    collected: Path, algorithm: str, cosine: bool
+) -> None:
+    learner = make_learner(collected, algorithm, lr=0.01, cosine=cosine)
+    learner.make_step(4)(3, one_action(8, algorithm))
+    rates = [optimizer.param_groups[0]["lr"].item() for optimizer in learner.optimizers.values()]
+    assert rates == pytest.approx([0.005 if cosine else 0.01] * len(rates))
+
+
 # -- the task's index ------------------------------------------------------------------------------
 
 
@@ -227,7 +236,7 @@ def test_one_hot_bcq_acts_differently_in_the_same_state_for_another_task(collect
 
 @pytest.mark.slow
 def test_one_hot_bcq_learns_from_every_task_with_its_index(collected: Path) -> None:
-    batch = make_buffer(make_run(collected), "bcq_one_hot", ALL_TASKS).sample()
+    batch = make_buffer(make_run(collected), "bcq_one_hot", ALL_TASKS, {}).sample()
     assert batch.batch_size == (2, 8)
     for data in (batch, batch["next"]):
         index = data["observation"][..., OBSERVATION_DIM:]

@@ -19,7 +19,9 @@ pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
 from small_runs import TASKS, command_line, contents, started, study_run
+from small_runs import make_run as small_run
 from tensordict import TensorDict
+from torchrl.envs import ExplorationType, exploration_type
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.evaluation import read_results
@@ -32,7 +34,15 @@ from torchrl_bmrl.studies.algorithms import (
     make_loss,
     published,
 )
-from torchrl_bmrl.studies.baselines import BaselineSettings, baselines, make_buffer
+from torchrl_bmrl.studies.baselines import (
+    BaselineSettings,
+    Learner,
+    baselines,
+    evaluate_job,
+    has_agents,
+    make_buffer,
+    train_job,
+)
 
 SIZES = {"observation_dim": 3, "action_dim": 2}
 COEFFICIENTS = {
@@ -145,7 +155,12 @@ def test_a_command_with_another_kind_of_setting_is_refused(
 def test_the_critics_have_layer_norm_if_stage_1_has_and_rebracs_always(algorithm: str) -> None:
     def norms(layer_norm: bool) -> int:
         loss, _ = make_loss(algorithm, SIZES, (8, 8), {}, gamma=0.9, layer_norm=layer_norm)
-        return sum(isinstance(part, torch.nn.LayerNorm) for part in loss.qvalue_network.modules())
+        networks = [loss.qvalue_network, *([loss.value_network] if algorithm == "iql" else [])]
+        numbers = {
+            sum(isinstance(part, torch.nn.LayerNorm) for part in network.modules())
+            for network in networks
+        }
+        return numbers.pop() if len(numbers) == 1 else -1
 
     assert norms(True) == 2
     assert norms(False) == (2 if algorithm == "rebrac" else 0)
@@ -209,6 +224,77 @@ def test_n_steps_end_in_the_action_after_the_last_of_them(
     assert [reward for _, reward in rows_of(run, "iql")] == [0.5, 2, 2, 5, 6.5, 5]
 
 
+def test_rewards_are_standardised_if_those_of_stage_1_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = fake_run(tmp_path, monkeypatch, batch_size=256, standard_reward=True)
+    standard = (torch.arange(6.0) - 2.5) / torch.arange(6.0).std()
+    assert [reward for _, reward in rows_of(run, "iql")] == pytest.approx(standard.tolist())
+
+
+def trained_batch(
+    run: Run, monkeypatch: pytest.MonkeyPatch, algorithm: str, **coefficients: float
+) -> TensorDict:
+    """The batch that a training of one update gets."""
+    batches: list[TensorDict] = []
+
+    def record(update: int, batch: TensorDict) -> dict[str, torch.Tensor]:
+        batches.append(batch)
+        return {}
+
+    monkeypatch.setattr(Learner, "make_step", lambda *_: record)
+    train_job((run, (algorithm, "lift", 1, coefficients)), lambda _: None)
+    (batch,) = batches
+    return batch
+
+
+@pytest.mark.parametrize("algorithm", [name for name in OBJECTIVES if name[:2] != "bc"])
+def test_batches_contain_the_steps_of_their_rows_also_where_iql_reads_them(
+    algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = fake_run(tmp_path, monkeypatch, batch_size=64, n_steps=2)
+    batch = trained_batch(run, monkeypatch, algorithm)
+    assert set(batch["steps_to_next_obs"].flatten().tolist()) == {1, 2}
+    assert torch.equal(batch["next", "steps_to_next_obs"], batch["steps_to_next_obs"])
+
+
+def test_filtered_cloning_trains_on_the_given_share_of_the_episodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = fake_run(tmp_path, monkeypatch, batch_size=256)
+    batch = trained_batch(run, monkeypatch, "bc_best", share=1.0)
+    assert len(batch["action"].unique()) == 6
+
+
+@pytest.mark.parametrize("algorithm", [name for name in OBJECTIVES if name[:2] != "bc"])
+def test_a_baseline_has_the_layer_norm_of_the_run_and_its_own_coefficients(
+    algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = fake_run(tmp_path, monkeypatch, layer_norm=True)
+    given = COEFFICIENTS[algorithm]
+    data = make_buffer(run, algorithm, "lift", given).sample().reshape(-1)
+
+    def metrics(**coefficients: float) -> list[float]:
+        learner = Learner(run, algorithm, "lift", coefficients)
+        modules = learner.loss.qvalue_network.modules()
+        assert sum(isinstance(part, torch.nn.LayerNorm) for part in modules) == 2
+        torch.manual_seed(1)
+        return [value.item() for value in learner.make_step(100)(100, data.copy()).values()]
+
+    assert metrics(**published(algorithm)) == metrics()
+    assert metrics(**given) != metrics()
+
+
+def test_baselines_act_without_noise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, seen = fake_run(tmp_path, monkeypatch), []
+    monkeypatch.setattr(
+        "torchrl_bmrl.studies.baselines.evaluate_once", lambda *args, **_: args[3]([0])
+    )
+    monkeypatch.setattr(Run, "play", lambda *_, **__: seen.append(exploration_type()) or [])
+    evaluate_job((run, ("iql", "lift", {}, False)), lambda _: None)
+    assert seen == [ExplorationType.DETERMINISTIC]
+
+
 # -- whole runs ------------------------------------------------------------------------------------
 
 
@@ -251,6 +337,30 @@ def test_development_starts_are_other_starts_and_other_files(
     names = ("baselines", "baselines_paired", "baselines_dev", "baselines_dev_paired")
     assert tables == {f"{name}.{end}" for name in names for end in ("md", "csv")}
     assert {path.stem for path in (finished_copy / "studies").glob("baselines*")} == set(names[:2])
+
+
+@pytest.mark.robosuite
+def test_stage_1_has_agents_if_they_all_are_finished(finished_copy: Path) -> None:
+    run = small_run(finished_copy)
+    assert has_agents(run)
+    assert not has_agents(small_run(finished_copy, "bcq.epochs=3"))
+    run.agent_path("lift").unlink()
+    assert not has_agents(run)
+
+
+@pytest.mark.robosuite
+def test_without_agents_the_baselines_play_development_starts_alone(
+    collected_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played: list[str] = []
+    monkeypatch.setattr(
+        "torchrl_bmrl.studies.baselines.evaluate_once",
+        lambda run, task, policy, *_, **__: played.append(policy) or [],
+    )
+    settings = BaselineSettings(algorithms=["bc"], updates=4, starts="development")
+    with make_run(collected_run) as opened:
+        baselines(opened, settings)
+    assert set(played) == {"bc"}
 
 
 @pytest.mark.robosuite

@@ -7,6 +7,7 @@ compared; ``pytest -s`` prints the largest difference.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -115,29 +116,16 @@ def compare_bcq(
     return differences(library, snapshot(loss), expected)
 
 
-@pytest.mark.parametrize("options", BCQ_VARIANTS, ids=name_of)
-def test_one_update_of_bcq_is_that_of_the_equations(
-    options: dict[str, Any], record_property: Record
-) -> None:
-    report("BCQLoss", compare_bcq(**options), record_property)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"gamma": 0.96},
-        {"lmbda": 0.74},
-        {"latent_clip": 0.6},
-        {"kl_weight": 0.51},
-        {"kl_reduction": "sum"},
-        {"max_perturbation": 0.31},
-        {"value_bounds": (-0.3, 0.3)},
-        {"loss_function": "smooth_l1"},
-    ],
-    ids=name_of,
-)
-def test_a_slightly_different_bcq_does_not_agree(wrong: dict[str, Any]) -> None:
-    assert max(compare_bcq(perturbation=True, wrong=wrong).values()) > 1e-5
+BCQ_WRONG = [
+    {"gamma": 0.96},
+    {"lmbda": 0.74},
+    {"latent_clip": 0.6},
+    {"kl_weight": 0.51},
+    {"kl_reduction": "sum"},
+    {"max_perturbation": 0.31},
+    {"value_bounds": (-0.3, 0.3)},
+    {"loss_function": "smooth_l1"},
+]
 
 
 # -- PLAS ------------------------------------------------------------------------------------------
@@ -184,27 +172,14 @@ def compare_plas(
     return differences(library, snapshot(loss), expected)
 
 
-@pytest.mark.parametrize("options", PLAS_VARIANTS, ids=name_of)
-def test_one_update_of_plas_is_that_of_the_equations(
-    options: dict[str, Any], record_property: Record
-) -> None:
-    report("PLASLoss", compare_plas(**options), record_property)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"gamma": 0.96},
-        {"lmbda": 0.74},
-        {"kl_weight": 0.51},
-        {"kl_reduction": "sum"},
-        {"max_perturbation": 0.31},
-        {"loss_function": "smooth_l1"},
-    ],
-    ids=name_of,
-)
-def test_a_slightly_different_plas_does_not_agree(wrong: dict[str, Any]) -> None:
-    assert max(compare_plas(perturbation=True, wrong=wrong).values()) > 1e-5
+PLAS_WRONG = [
+    {"gamma": 0.96},
+    {"lmbda": 0.74},
+    {"kl_weight": 0.51},
+    {"kl_reduction": "sum"},
+    {"max_perturbation": 0.31},
+    {"loss_function": "smooth_l1"},
+]
 
 
 # -- ReBRAC ----------------------------------------------------------------------------------------
@@ -252,28 +227,15 @@ def compare_rebrac(
     return differences(library, snapshot(loss), expected)
 
 
-@pytest.mark.parametrize("options", REBRAC_VARIANTS, ids=name_of)
-def test_one_update_of_rebrac_is_that_of_the_equations(
-    options: dict[str, Any], record_property: Record
-) -> None:
-    report("ReBRACLoss", compare_rebrac(**options), record_property)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"gamma": 0.96},
-        {"actor_penalty": 0.31},
-        {"critic_penalty": 0.21},
-        {"normalise_q": False},
-        {"policy_noise": 0.41},
-        {"noise_clip": 0.3},
-        {"loss_function": "smooth_l1"},
-    ],
-    ids=name_of,
-)
-def test_a_slightly_different_rebrac_does_not_agree(wrong: dict[str, Any]) -> None:
-    assert max(compare_rebrac(wrong=wrong).values()) > 1e-5
+REBRAC_WRONG = [
+    {"gamma": 0.96},
+    {"actor_penalty": 0.31},
+    {"critic_penalty": 0.21},
+    {"normalise_q": False},
+    {"policy_noise": 0.41},
+    {"noise_clip": 0.3},
+    {"loss_function": "smooth_l1"},
+]
 
 
 # -- discrete BCQ ----------------------------------------------------------------------------------
@@ -315,17 +277,47 @@ def compare_discrete_bcq(
     return differences(library, snapshot(loss), expected)
 
 
-@pytest.mark.parametrize("options", DISCRETE_VARIANTS, ids=name_of)
-def test_one_update_of_discrete_bcq_is_that_of_the_equations(
-    options: dict[str, Any], record_property: Record
+DISCRETE_WRONG = [
+    {"gamma": 0.96},
+    {"threshold": 0.0},
+    {"logits_weight": 0.011},
+    {"loss_function": "l2"},
+]
+
+
+# -- all of them -----------------------------------------------------------------------------------
+
+LOSSES: dict[str, tuple[Callable[..., Differences], Any, Any, dict[str, Any]]] = {
+    "BCQLoss": (compare_bcq, BCQ_VARIANTS, BCQ_WRONG, {"perturbation": True}),
+    "PLASLoss": (compare_plas, PLAS_VARIANTS, PLAS_WRONG, {"perturbation": True}),
+    "ReBRACLoss": (compare_rebrac, REBRAC_VARIANTS, REBRAC_WRONG, {}),
+    "DiscreteBCQLoss": (
+        compare_discrete_bcq,
+        DISCRETE_VARIANTS,
+        DISCRETE_WRONG,
+        {"num_critics": 2},
+    ),
+}
+"""For each loss its comparison, the options that agree, wrong ones, and the options with these."""
+
+
+def cases(index: int) -> list[Any]:
+    """Each loss with each of its options, those that agree (1) or the wrong ones (2)."""
+    return [
+        pytest.param(loss, options, id=f"{loss}-{name_of(options)}")
+        for loss, entry in LOSSES.items()
+        for options in entry[index]
+    ]
+
+
+@pytest.mark.parametrize(("loss", "options"), cases(1))
+def test_one_update_is_that_of_the_equations(
+    loss: str, options: dict[str, Any], record_property: Record
 ) -> None:
-    report("DiscreteBCQLoss", compare_discrete_bcq(**options), record_property)
+    report(loss, LOSSES[loss][0](**options), record_property)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [{"gamma": 0.96}, {"threshold": 0.0}, {"logits_weight": 0.011}, {"loss_function": "l2"}],
-    ids=name_of,
-)
-def test_a_slightly_different_discrete_bcq_does_not_agree(wrong: dict[str, Any]) -> None:
-    assert max(compare_discrete_bcq(num_critics=2, wrong=wrong).values()) > 1e-5
+@pytest.mark.parametrize(("loss", "wrong"), cases(2))
+def test_a_slightly_different_update_does_not_agree(loss: str, wrong: dict[str, Any]) -> None:
+    compare, _, _, options = LOSSES[loss]
+    assert max(compare(**options, wrong=wrong).values()) > 1e-5

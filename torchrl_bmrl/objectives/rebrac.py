@@ -37,10 +37,11 @@ class ReBRACLoss(OfflineLoss):
     2. :meth:`actor_loss`: :math:`\beta_1 \lVert \pi(s) - a \rVert^2 - \min_j Q_j(s, \pi(s)) / n`,
        where n is the mean of :math:`|\min_j Q_j(s, \pi(s))|` over the batch, without gradient
 
-    As published, the critics have layer normalisation, and the actor and all targets move at every
-    second update: call :meth:`actor_loss` and step the targets then. The penalties are tuned for
-    each data set: β₁ among 0.001, 0.01, 0.05 and 0.1, β₂ among 0, 0.001, 0.01, 0.1 and 0.5. So the
-    defaults are only a start.
+    As published, the critics have layer normalisation, and :meth:`actor_loss` is minimised and the
+    targets are stepped only at every second update. The defaults of the penalties are a start: the
+    authors tune both for each data set. Their grid for MuJoCo and Adroit
+    (https://github.com/DT6A/ReBRAC) is β₁ in 0.001, 0.01, 0.05, 0.1 and β₂ in 0, 0.001, 0.01, 0.1,
+    0.5.
 
     Args:
         actor_network: π (observation → ``action`` within the bounds), deterministic.

@@ -63,7 +63,7 @@ def make_critics(
     *,
     layer_norm: bool = False,
 ) -> list[TensorDictModule]:
-    """Two critics."""
+    """Two critics, as published."""
     options: dict[str, Any] = {"num_cells": cells, "layer_norm": layer_norm}
     return [make_qvalue_network(observation_dim, action_dim, **options) for _ in range(2)]
 
@@ -99,7 +99,7 @@ def rebrac(
     actor_penalty: float = 0.1,
     critic_penalty: float = 0.1,
 ) -> Algorithm:
-    """TD3 with penalties on actor and critics, whose critics always have layer normalisation."""
+    """TD3 with penalties on actor and critics; the critics always have layer normalisation."""
     actor = make_actor(observation_dim, action_dim, cells)
     critics = make_critics(observation_dim, action_dim, cells, layer_norm=True)
     options: dict[str, Any] = {"actor_penalty": actor_penalty, "critic_penalty": critic_penalty}
@@ -176,16 +176,17 @@ DATA: Mapping[str, Callable[..., TensorDictBase]] = {
     "bc_best": best_episodes,
     "rebrac": with_next_action,
 }
-"""Functions that turn a task's transitions into the training data, for the others the identity."""
+"""Functions that turn a task's transitions into the training data; the others need none."""
 
 
 # -- coefficients ----------------------------------------------------------------------------------
 
 
 def published(algorithm: str) -> dict[str, float]:
-    """The coefficients of an algorithm with their published values.
+    """The coefficients of an algorithm with their published values, and ReBRAC's with 0.1.
 
-    They are the numbers among the defaults of the functions in :data:`ALGORITHMS` and :data:`DATA`.
+    ReBRAC has other published values for each data set. The values are the numbers among the
+    defaults of the functions in :data:`ALGORITHMS` and :data:`DATA`.
 
     Example:
         >>> published("iql"), published("bc_best"), published("bcq_one_hot")

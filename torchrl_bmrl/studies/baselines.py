@@ -50,7 +50,7 @@ from torchrl_bmrl.studies.baselines_report import make_paired_table, make_table
 from torchrl_bmrl.training.checkpoint import load_newest, resume_training, save_training
 from torchrl_bmrl.training.fit import Every, fit
 from torchrl_bmrl.training.health import check_metrics
-from torchrl_bmrl.training.update import gradient_step, keep_freed_memory, make_adam
+from torchrl_bmrl.training.update import decay, gradient_step, keep_freed_memory, make_adam
 
 ONE_HOT = "bcq_one_hot"
 """One BCQ agent for all tasks, whose observation contains the task's one-hot index."""
@@ -221,11 +221,9 @@ class Learner:
         coefficients: those that differ from the published ones.
     """
 
-    def __init__(
-        self, run: Run, algorithm: str, task: str, coefficients: Coefficients | None = None
-    ) -> None:
+    def __init__(self, run: Run, algorithm: str, task: str, coefficients: Coefficients) -> None:
         self.run, self.algorithm, self.name = run, algorithm, f"{algorithm}-{task}"
-        self.coefficients = dict(coefficients or {})
+        self.coefficients = dict(coefficients)
         self.path = checkpoint_path(run, algorithm, task)
         sizes, bcq = sizes_of(run.transitions(run.names[0], "train")), run.settings.bcq
         torch.manual_seed(run.seed("baselines", self.name))
@@ -264,6 +262,7 @@ class Learner:
         Args:
             total: number of updates.
         """
+        bcq = self.run.settings.bcq
         if self.algorithm == ONE_HOT:
             optimizers = {key.removesuffix("_network"): x for key, x in self.optimizers.items()}
             return make_step(self.run, self.loss, optimizers, self.targets, total)
@@ -272,6 +271,9 @@ class Learner:
         # takes longer than it saves.
         def step(update: int, batch: TensorDictBase) -> dict[str, Tensor]:
             metrics, chosen = {}, objectives(self.algorithm, update, total)
+            if bcq.cosine:
+                for optimizer in self.optimizers.values():
+                    decay(optimizer, bcq.lr, update, total)
             for network, objective in chosen.items():
                 value = objective(self.loss, batch)
                 gradient_step(self.optimizers[network], value)
@@ -310,15 +312,13 @@ class Learner:
         )
 
 
-def make_buffer(
-    run: Run, algorithm: str, task: str, coefficients: Coefficients | None = None
-) -> ReplayBuffer:
+def make_buffer(run: Run, algorithm: str, task: str, coefficients: Coefficients) -> ReplayBuffer:
     """The demonstrations that an algorithm learns from, with one row of the batch per task."""
     datasets, bcq = [], replace(run.settings.bcq, action_chunk=1)
     for index, name in enumerate(run.names):
         if task not in (name, ALL_TASKS):
             continue
-        data = training_data(algorithm, run.transitions(name, "train"), coefficients or {})
+        data = training_data(algorithm, run.transitions(name, "train"), coefficients)
         # After the next actions, which become those after the last of the n steps.
         (data,) = stage_1_data([data], bcq)
         if algorithm == ONE_HOT:

@@ -64,10 +64,10 @@ def make_table(
             "demonstrations unless it was evaluated. BCQ: stage 1, one agent per task. Distilled: "
             "stage 2, with the source of m in brackets. BC, TD3+BC, IQL and CQL: TorchRL's losses, "
             "one policy per task; ReBRAC: this library's. BC, best episodes: of the demonstrations "
-            "with the largest returns. BCQ, "
-            "one-hot task: one agent trained on all tasks, whose observation contains the task's "
-            f"index; {updates:,} updates each. Coefficients: "
-            f"{', '.join(tuned) + ', otherwise ' if tuned else ''}as published. Interval: "
+            "with the largest returns. BCQ, one-hot task: one agent trained on all tasks, whose "
+            f"observation contains the task's index. {updates:,} updates each. Coefficients: "
+            f"{', '.join(tuned) + ', otherwise ' if tuned else ''}as published; those of ReBRAC, "
+            "which has none for all data, are 0.1 by default. Interval: "
             "bootstrap over the episodes of each task."
         ),
         header=("Policy", *columns.values(), "Success, all", "95% interval", "Episodes"),
