@@ -306,7 +306,7 @@ def test_messages_name_all_agents_of_a_finding_once_and_what_to_do() -> None:
         "the candidates of reach, push vary less than the demonstrations (spread_ratio 0.04 to "
         "0.08, below 0.2), so these policies clone; "
     )
-    for remedy in ("bcq.generator=mixture", "bcq.kl_weight", "bcq.latent_clip=null"):
+    for remedy in ("bcq.generator=gaussian", "bcq.kl_weight", "bcq.latent_clip=null"):
         assert remedy in collapse_message(found)
     assert outside_message(found).startswith(
         "pull: most chosen actions are unlike the demonstrations (outside_share 0.70, above 0.5)"

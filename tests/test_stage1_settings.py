@@ -53,14 +53,17 @@ def trained(folder: Path, **bcq: Any) -> Run:
 # -- generators and critics ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "latent"), [("flow", 0), ("mixture", 1)])
+@pytest.mark.parametrize(("name", "latent"), [("flow", 0), ("gaussian", 1), ("mixture", 1)])
 def test_both_stages_run_with_another_generator(tmp_path: Path, name: str, latent: int) -> None:
     run = trained(tmp_path, generator=name)
     with run:
         stage2(run)
     loss, (student, metadata) = run.teacher("door"), run.student()
-    kinds = {"flow": ActionFlow, "mixture": ActionMixture}
+    kinds = {"flow": ActionFlow, "gaussian": ActionMixture, "mixture": ActionMixture}
     assert isinstance(loss.generator, kinds[name])
+    if name != "flow":
+        components = loss.generator.decoder.module.num_components
+        assert (components == 1) == (name == "gaussian")
     action_dim = run.transitions("door", "train")["action"].shape[-1]
     assert student.latent_dim == action_dim + latent
     assert metadata["latent_clip"] is None

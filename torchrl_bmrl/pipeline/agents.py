@@ -43,6 +43,7 @@ _SIX_TASKS = {"observation_dim": 33, "action_dim": 7}
 GENERATORS: dict[str, Callable[..., LatentGenerator]] = {
     "autoencoder": ActionVAE,
     "flow": ActionFlow,
+    "gaussian": partial(ActionMixture, num_components=1),
     "mixture": ActionMixture,
 }
 """Generators of stage 1 by name."""

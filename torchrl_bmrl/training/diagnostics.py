@@ -253,7 +253,8 @@ def collapse_message(found: Mapping[str, Diagnostics]) -> str:
         {name: x.spread_ratio for name, x in found.items() if x.collapsed},
         "the candidates of {names} vary less than the demonstrations (spread_ratio {span}, below "
         f"{COLLAPSED}), so these policies clone; to improve on the demonstrations try "
-        "bcq.generator=mixture or flow, or a lower bcq.kl_weight and bcq.latent_clip=null",
+        "bcq.generator=gaussian, mixture or flow, or a lower bcq.kl_weight and "
+        "bcq.latent_clip=null",
     )
 
 
