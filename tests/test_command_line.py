@@ -215,6 +215,7 @@ OF_WEAK = {
     *("acting_100", "acting_first", "autoencoder", "chunks_4", "critics_2", "flow", "gamma_99"),
     "mixture",
     *("no_advantage", "no_layer_norm", "published", "raw_rewards", "steps_1", "steps_5"),
+    "target_min",
 }
 """Ablations that undo a step of the preset ``weak``; others may have it undone already."""
 
@@ -278,6 +279,10 @@ def test_what_each_ablation_takes_away_is_away(recipes: Any, tmp_path: Path) -> 
     assert ablated("no_advantage").distill.advantage_weight == 0
     assert not ablated("no_layer_norm").bcq.layer_norm
     assert not ablated("raw_rewards").bcq.standard_reward
+    assert (ablated("target_min").bcq.target_rule, ablated("target_min").bcq.lmbda) == (
+        "clipped",
+        1,
+    )
     assert ablated("critics_2").bcq.num_qvalue_nets == 2
     assert ablated("gamma_99").bcq.gamma == 0.99
     assert [ablated(f"acting_{n}").evaluate.num_candidates for n in (1, 10, 100)] == [1, 10, 100]
