@@ -259,6 +259,7 @@ def test_sections_without_data_are_left_out(page: str) -> None:
         "Paired differences",
         "Ablations of stage 1",
         "Diagnostics of stage 1",
+        "How the settings were chosen",
         "Running times",
         "How to reproduce the runs",
         "Everything measured",
@@ -269,6 +270,7 @@ def test_sections_without_data_are_left_out(page: str) -> None:
     assert headings(little) == [
         "In short",
         "Every policy and task",
+        "How the settings were chosen",
         "Running times",
         "How to reproduce the runs",
         "Everything measured",

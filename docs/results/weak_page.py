@@ -52,6 +52,7 @@ def make_weak_page(published: Published) -> Page:
         *_main_sections(rows, summaries, runs),
         *table_section("Ablations of stage 1", steps),
         *table_section("Diagnostics of stage 1", agents),
+        Section(heading="How the settings were chosen", paragraphs=[prose("weak_tried")]),
         *runs_sections(
             published.runs, baselines=bool(baselines_of(rows)), note=NOTE if alone else ""
         ),
