@@ -23,7 +23,7 @@ from published import TASKS, Published, write_published
 from results_page import make_results_page
 from targets import best_source, covered, weak_targets_table
 from weak_page import check_weak_page, make_weak_page, write_weak_page
-from weak_tables import steps_table
+from weak_tables import pushes_table, steps_table
 
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.evaluation import ResultRow, summarise
@@ -249,6 +249,24 @@ def test_diagnostics_stand_by_run_and_task(page: str) -> None:
     ]
 
 
+def test_pushes_are_counted_in_intervals_of_their_return_with_their_successes() -> None:
+    def row(task: str, value: float, success: bool) -> ResultRow:
+        return ResultRow(
+            task=task, policy="bcq", seed=1, episode=0, episode_return=value, success=success
+        )
+
+    rows = [row("push_up", 249.9, False), row("push_down", 250.0, True), row("lift", 260.0, True)]
+    rows += [row("push_left", 299.0, False), row("push_left", 400.0, True)]
+    assert pushes_table(rows).rows == [
+        ("below 250", "0", "1 (0%)", "0"),
+        ("250 to 300", "0", "2 (50%)", "0"),
+        ("300 to 350", "0", "0", "0"),
+        ("350 to 400", "0", "0", "0"),
+        ("400 or more", "0", "1 (100%)", "0"),
+    ]
+    assert not pushes_table([row("lift", 260.0, True)]).rows
+
+
 def test_sections_without_data_are_left_out(page: str) -> None:
     def headings(text: str) -> list[str]:
         return re.findall(r"^## (.*)$", text, re.MULTILINE)
@@ -257,6 +275,7 @@ def test_sections_without_data_are_left_out(page: str) -> None:
         "In short",
         "Every policy and task",
         "Paired differences",
+        "Where the pushes fall short",
         "Ablations of stage 1",
         "Diagnostics of stage 1",
         "How the settings were chosen",
@@ -270,6 +289,7 @@ def test_sections_without_data_are_left_out(page: str) -> None:
     assert headings(little) == [
         "In short",
         "Every policy and task",
+        "Where the pushes fall short",
         "How the settings were chosen",
         "Running times",
         "How to reproduce the runs",

@@ -28,7 +28,7 @@ from pages import (
 )
 from published import TASKS, WEAK, Published, RunRow, read_published
 from targets import best_source, weak_targets_table
-from weak_tables import agents_table, returns_table, steps_table
+from weak_tables import agents_table, pushes_table, returns_table, steps_table
 
 from torchrl_bmrl.evaluation.results import ResultRow, Summary, summarise
 from torchrl_bmrl.reports import Section, results_table, task_name
@@ -105,6 +105,7 @@ def _main_sections(
         ),
         Section(heading="Every policy and task", tables=[returns_table(rows, TITLES)]),
         *table_section("Paired differences", make_paired_table(rows, TITLES)),
+        *table_section("Where the pushes fall short", pushes_table(rows)),
     ]
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
+from statistics import fmean
 
 import numpy as np
 from comparisons import BCQ, difference, share
@@ -15,6 +17,9 @@ from torchrl_bmrl.studies.baselines_report import make_table
 
 Change = tuple[str, str]
 """Preset and ablation."""
+PUSHES = tuple(task for task in TASKS if task.startswith("push"))
+RETURN_LIMITS = (250, 300, 350, 400)
+"""Limits between the intervals of :func:`pushes_table`."""
 
 
 def returns_table(rows: Sequence[ResultRow], titles: dict[str, str]) -> Table:
@@ -30,6 +35,31 @@ def returns_table(rows: Sequence[ResultRow], titles: dict[str, str]) -> Table:
             "[baselines.md](baselines.md) describes the other algorithms. Interval: bootstrap over "
             "the episodes of each task."
         ),
+    )
+
+
+def pushes_table(rows: Sequence[ResultRow]) -> Table:
+    """Counts the push episodes of both stages by their return, and their successes."""
+    pushes = [row for row in rows if row.task in PUSHES]
+    lines = []
+    for low, high in pairwise((-np.inf, *RETURN_LIMITS, np.inf)):
+        cells = []
+        for policy in ("expert", "bcq", "distilled"):
+            solved = [
+                bool(row.success)
+                for row in pushes
+                if row.policy == policy and low <= row.episode_return < high
+            ]
+            cells.append(f"{len(solved)} ({percent(fmean(solved))})" if solved else "0")
+        lines.append((_interval(low, high), *cells))
+    return Table(
+        title="Pushes by return",
+        caption=(
+            "Episodes of the pushes whose return is in an interval, and the share of them that "
+            "succeeded. Distilled: all sources of m."
+        ),
+        header=("Return", "Expert", "BCQ", "Distilled"),
+        rows=lines if pushes else [],
     )
 
 
@@ -85,6 +115,12 @@ def agents_table(rows: Sequence[DiagnosticsRow]) -> Table:
             for key, agents in runs.items()
         ],
     )
+
+
+def _interval(low: float, high: float) -> str:
+    if low == -np.inf:
+        return f"below {high:g}"
+    return f"{low:g} or more" if high == np.inf else f"{low:g} to {high:g}"
 
 
 def _evaluated(published: Published, change: Change) -> list[ResultRow]:
