@@ -260,6 +260,21 @@ def test_the_published_stage_1_has_the_settings_of_the_published_presets(
     assert quick.evaluate.num_candidates == config.evaluate.num_candidates
 
 
+def test_the_settings_of_stage_1_in_the_docs_are_those_of_the_presets(
+    recipes: Any, tmp_path: Path
+) -> None:
+    page = (RECIPES.parent / "docs" / "pipeline.md").read_text(encoding="utf-8")
+    section = page.split("## Settings of stage 1\n")[1].split("\n## ")[0]
+    found = re.findall(r"^\| `(\w+)\.(\w+)` \| `?([^|`]+?)`? \| `?([^|`]+?)`? \|", section, re.M)
+    assert len(found) == 13
+    presets = [settings_of(f"preset={name}", f"run_dir={tmp_path}") for name in ("quick", "weak")]
+    for group, name, *shown in found:
+        for preset, text in zip(presets, shown, strict=True):
+            value = getattr(getattr(preset, group), name)
+            if text != "not used":
+                assert text == (str(value).lower() if isinstance(value, bool) else f"{value}"), name
+
+
 def test_what_each_ablation_takes_away_is_away(recipes: Any, tmp_path: Path) -> None:
     def ablated(name: str) -> Any:
         return settings_of(f"ablation={name}", f"run_dir={tmp_path}")
