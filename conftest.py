@@ -1,6 +1,7 @@
 """What every test run shares: one thread, and clear skips where something is not installed."""
 
 import os
+import signal
 
 # Before torch is imported: many small networks run fastest on one thread each.
 for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -135,6 +136,19 @@ def stored_configurations() -> Iterator[None]:
     yield
     for group in _STORED:
         del repo[group]
+
+
+@pytest.fixture
+def signals_not_ignored() -> Iterator[None]:
+    """No stop signal is ignored, as SIGHUP is under nohup and SIGINT in the background of a shell.
+
+    Ignored signals stay ignored in a run, so a test that sends one would wait for ever.
+    """
+    defaults = {signal.SIGINT: signal.default_int_handler, signal.SIGHUP: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in defaults.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @cache

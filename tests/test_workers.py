@@ -196,6 +196,7 @@ def signal_when_all_work(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("signals_not_ignored")
 @pytest.mark.parametrize(
     ("workers", "names", "number", "group"),
     [
