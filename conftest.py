@@ -71,6 +71,7 @@ _NEEDS = {
         "tests/explorers.py",
         "tests/published_data.py",
         "tests/report_data.py",
+        "tests/weak_data.py",
         "torchrl_bmrl/reports/*",
     ],
     "minari": ["tests/minari_files.py", "torchrl_bmrl/data/convert.py"],

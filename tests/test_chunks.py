@@ -97,6 +97,7 @@ class _Counting(TensorDictModuleBase):
 
 
 def test_a_rollout_plays_each_chunk_to_its_end() -> None:
+    pytest.importorskip("gymnasium")
     env = GymEnv("Pendulum-v1")
     inner = _Counting(scale=0.05)
     data = env.rollout(8, ChunkPolicy(inner, 3))
@@ -117,6 +118,7 @@ def test_rows_of_a_batch_end_their_chunks_and_episodes_independently() -> None:
 
 
 def test_an_environment_that_resets_by_itself_starts_a_new_chunk() -> None:
+    pytest.importorskip("gymnasium")
     env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(StepCounter(max_steps=4), InitTracker()))
     data = env.rollout(8, ChunkPolicy(_Counting(scale=0.01), 3), break_when_any_done=False)
     played = (100 * data["action"]).round().flatten().tolist()
