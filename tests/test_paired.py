@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
+pytest.importorskip("scipy")
+pytest.importorskip("matplotlib")
+
 from helpers import refused
 
 from torchrl_bmrl.evaluation import ResultRow, paired_difference
+from torchrl_bmrl.studies.baselines_report import make_paired_table
 
 OURS, THEIRS = ("td3_bc", ""), ("bc", "")
 
@@ -107,9 +112,6 @@ def test_two_runs_with_the_same_seed_are_refused() -> None:
 
 
 def test_the_table_compares_each_policy_with_each_reference_but_none_with_itself() -> None:
-    pytest.importorskip("matplotlib")
-    from torchrl_bmrl.studies.baselines_report import make_paired_table
-
     rows = rows_of("expert", 10.0)
     for policy, value in (("bc", 4.0), ("iql", 5.0), ("bcq", 6.0)):
         rows += rows_of(policy, value, value)
