@@ -76,9 +76,21 @@ def make_folder(path: Path, *overrides: str, seed: int = 3) -> Path:
     return path
 
 
+def add_baselines(folder: Path, seed: int = 3, **coefficients: dict[str, float]) -> list[ResultRow]:
+    """Adds evaluated baselines, by algorithm, with the coefficients of their checkpoints."""
+    rows = [replace(row, policy=name) for name in coefficients for row in rows_of(seed, "bcq")]
+    write_results(folder / "baselines.csv", rows)
+    for name, given in coefficients.items():
+        metadata = {"kind": "baseline", "coefficients": given} if given else {"kind": "baseline"}
+        for task in TASKS:
+            path = folder / "baselines" / f"{name}-{task}" / "checkpoint.safetensors"
+            save_checkpoint(path, {"a": torch.ones(1)}, metadata)
+    return rows
+
+
 def test_a_folder_becomes_rows(publish: Any, tmp_path: Path) -> None:
     run_dir = make_folder(tmp_path / "run", "preset=paper")
-    write_results(run_dir / "baselines.csv", rows_of(3, "bc"))
+    baselines = add_baselines(run_dir, bc={}, iql={"expectile": 0.7, "temperature": 3.0})
     docs = tmp_path / "docs"
     publish.publish([run_dir], docs)
     published = read_published(docs / "results")
@@ -88,11 +100,51 @@ def test_a_folder_becomes_rows(publish: Any, tmp_path: Path) -> None:
     assert (run.commit, run.versions) == ("abc", "torch 2.13")
     assert (run.accuracy, run.task_latent_dim) == (0.98765, 4)
     assert (run.seconds_stage_1, run.seconds_stage_2) == (60.0, None)
-    assert {e.row for e in published.episodes} == set(rows_of(3, "expert", "bcq", "bc"))
+    assert {e.row for e in published.episodes} == set(rows_of(3, "expert", "bcq") + baselines)
     assert [(c.task, c.seed, c.episode_return) for c in published.curves] == [
         (task, 3, 0.333) for task in TASKS
     ]
     publish.check_results_page(docs)
+
+
+def test_baselines_with_other_coefficients_are_named_by_them(publish: Any, tmp_path: Path) -> None:
+    docs = tmp_path / "docs"
+    run_dir = make_folder(tmp_path / "run", "preset=weak_paper")
+    tuned = make_folder(tmp_path / "tuned", "preset=weak_paper")
+    add_baselines(run_dir, iql={}, rebrac={"actor_penalty": 1.0})
+    add_baselines(tuned, iql={"expectile": 0.5, "temperature": 3.0})
+    publish.publish([run_dir], docs, baselines=[tuned])
+    policies = {e.row.policy for e in read_published(docs / "results" / "weak").episodes}
+    named = {"iql", "IQL, expectile 0.5", "ReBRAC, actor_penalty 1"}
+    assert policies == {"expert", "bcq", *named}
+    publish.check_weak_page(docs)
+
+
+@pytest.mark.parametrize(
+    ("seed", "given", "says"),
+    [
+        (4, {"expectile": 0.5}, r"tuned belongs to run \('weak_paper', 'none', 4\)"),
+        (3, {}, "policy: 'iql' is in .*run or another folder, too"),
+    ],
+)
+def test_baselines_of_no_run_and_those_that_are_there_already_are_refused(
+    publish: Any, tmp_path: Path, seed: int, given: dict[str, float], says: str
+) -> None:
+    run_dir = make_folder(tmp_path / "run", "preset=weak_paper")
+    tuned = make_folder(tmp_path / "tuned", "preset=weak_paper", seed=seed)
+    add_baselines(run_dir, iql={})
+    add_baselines(tuned, seed, iql=given)
+    with pytest.raises(BMRLError, match=says):
+        publish.publish([run_dir], tmp_path / "docs", baselines=[tuned])
+    assert not (tmp_path / "docs").exists()
+
+
+def test_a_baseline_without_its_checkpoint_is_refused(publish: Any, tmp_path: Path) -> None:
+    run_dir = make_folder(tmp_path / "run", "preset=paper")
+    add_baselines(run_dir, iql={})
+    shutil.rmtree(run_dir / "baselines")
+    with pytest.raises(BMRLError, match="iql-reach"):
+        publish.publish([run_dir], tmp_path / "docs")
 
 
 @pytest.mark.slow
@@ -245,6 +297,19 @@ def test_only_finished_changes_of_weak_runs_may_have_stage_1_alone(
     with pytest.raises(BMRLError, match=says):
         publish.publish([run_dir], tmp_path / "docs")
     assert not (tmp_path / "docs").exists()
+
+
+def test_a_change_may_be_measured_on_some_of_the_tasks(publish: Any, tmp_path: Path) -> None:
+    tasks = ["lift", "push_right"]
+    run_dir = stage_1_folder(
+        tmp_path / "run", "preset=weak", "ablation=dim4", f"tasks=[{','.join(tasks)}]"
+    )
+    for task in set(TASKS) - set(tasks):
+        shutil.rmtree(run_dir / "bcq" / task)
+    publish.publish([run_dir], tmp_path / "docs")
+    published = read_published(tmp_path / "docs" / "results" / "weak")
+    assert [c.task for c in published.curves] == tasks
+    assert f"'tasks={json.dumps(tasks)}'" in published.runs[0].command
 
 
 def test_episodes_of_another_seed_are_refused(publish: Any, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Adds finished runs to CSV files below docs/results and writes docs/results.md and docs/weak.md.
 
     python docs/results/publish.py runs/two_stage-paper-seed1 runs/two_stage-paper-seed2
+    python docs/results/publish.py runs/weak_paper-1 --baselines runs/tuned-1  # other coefficients
     python docs/results/publish.py            # writes the pages again
     python docs/results/publish.py --check    # exits with 1 if a page is not what the files give
 
@@ -21,6 +22,7 @@ import math
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -45,8 +47,11 @@ from weak_page import check_weak_page, write_weak_page
 from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.evaluation import ResultRow, read_results
 from torchrl_bmrl.files import read_json
+from torchrl_bmrl.reports.tables import policy_name
 from torchrl_bmrl.run.command_line import exit_codes
 from torchrl_bmrl.run.folder import deciding, read_settings, read_versions
+from torchrl_bmrl.studies.algorithms import published as published_coefficients
+from torchrl_bmrl.studies.baselines import ALL_TASKS, ONE_HOT, checkpoint_path
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 from torchrl_bmrl.training.diagnostics import read_diagnostics
 
@@ -55,15 +60,24 @@ RECIPES = DOCS.parent / "recipes"
 STAGES = ("collect", "stage 1", "stage 2", "evaluate")
 
 
-def publish(runs: Sequence[Path], docs: Path = DOCS) -> list[Path]:
+def publish(
+    runs: Sequence[Path], docs: Path = DOCS, *, baselines: Sequence[Path] = ()
+) -> list[Path]:
     """Adds the runs to the CSV files and writes the pages.
+
+    Args:
+        runs: folders of finished runs.
+        docs: folder of the pages.
+        baselines: folders with further baselines of these runs, which have other coefficients.
 
     Returns:
         paths of the pages.
 
     Raises:
-        BMRLError: if a file of a run is missing or not valid; nothing is written then.
+        BMRLError: if a file of a run is missing or not valid, or a folder of baselines belongs to
+            none of the runs; nothing is written then.
     """
+    further = by_run(baselines)
     folders = [docs / "results", docs / "results" / "weak"]
     published = [read_published(folder) for folder in folders]
     for run_dir in runs:
@@ -71,10 +85,12 @@ def publish(runs: Sequence[Path], docs: Path = DOCS) -> list[Path]:
         weak = run.preset in WEAK_PRESETS
         published[weak] = published[weak].with_run(
             run,
-            read_episodes(run_dir, run),
+            read_episodes(run_dir, run, further.pop(run.key, [])),
             read_curves(run_dir, run.key),
             read_agents(run_dir, run.key) if weak else [],
         )
+    for key, (first, *_) in further.items():
+        raise ConfigError(f"{first} belongs to run {key} (preset, ablation, seed); valid: a run given")
     for folder, content in zip(folders, published, strict=True):
         write_published(folder, content)
     pages = [write_results_page(docs), write_weak_page(docs)]
@@ -122,36 +138,79 @@ def is_stage_1_alone(run_dir: Path, settings: Mapping[str, Any]) -> bool:
 
 
 def check_stage_1(run_dir: Path, settings: Mapping[str, Any]) -> None:
-    """Checks that the agents of all tasks were rolled out after the last epoch.
+    """Checks that the agents of the run's tasks were rolled out after the last epoch.
 
     Raises:
         DataError: naming the first file that is missing or too short.
     """
     key = settings["preset"], settings["ablation"], settings["seed"]
     last = settings["bcq"]["epochs"]
-    for task in TASKS:
+    for task in settings["tasks"] or TASKS:
         path = run_dir / "bcq" / task / "evaluations.csv"
         epoch = max((row.epoch for row in read_curve_rows(path, run=key, task=task)), default=0)
         if epoch != last:
             raise DataError(path, "epoch", f"the last is {epoch}; valid: {last}, as bcq.epochs")
 
 
-def read_episodes(run_dir: Path, run: RunRow) -> list[ResultRow]:
+def by_run(baselines: Sequence[Path]) -> dict[Key, list[Path]]:
+    """Groups folders of baselines by preset, ablation and seed."""
+    groups: dict[Key, list[Path]] = {}
+    for folder in baselines:
+        settings = read_settings(folder)
+        key = settings["preset"], settings["ablation"], settings["seed"]
+        groups.setdefault(key, []).append(folder)
+    return groups
+
+
+def read_episodes(run_dir: Path, run: RunRow, baselines: Sequence[Path] = ()) -> list[ResultRow]:
     """Reads the evaluated episodes of a run; a run of stage 1 alone has none.
 
+    Args:
+        run_dir: folder of the run.
+        run: its row.
+        baselines: folders with further baselines on the same demonstrations.
+
     Raises:
-        BMRLError: if a file is missing or not valid, or an episode has another seed than the run.
+        BMRLError: if a file is missing or not valid, an episode has another seed than the run, or
+            two folders contain the same baseline.
     """
     if not run.evaluated:
         return []
     rows = read_results(run_dir / "results.csv")
-    if (path := run_dir / "baselines.csv").exists():
-        rows += read_results(path)
+    if (run_dir / "baselines.csv").exists():
+        rows += read_baselines(run_dir)
+    for folder in baselines:
+        more, present = read_baselines(folder), {row.policy for row in rows}
+        for policy in sorted(present & {row.policy for row in more}):
+            message = f"{policy!r} is in {run_dir} or another folder, too; valid: once"
+            raise DataError(folder / "baselines.csv", "policy", message)
+        rows += more
     for row in rows:
         if row.seed != run.seed:
             message = f"{row.seed}; the run's is {run.seed}"
             raise DataError(run_dir / "results.csv", "seed", message)
     return rows
+
+
+def read_baselines(folder: Path) -> list[ResultRow]:
+    """Reads a folder's baselines; coefficients that are not the published ones join the names.
+
+    Raises:
+        BMRLError: if a file or a checkpoint is missing or not valid.
+    """
+    rows = read_results(folder / "baselines.csv")
+    keys = dict.fromkeys((row.policy, row.task) for row in rows)
+    names = {key: name_of(folder, *key) for key in keys}
+    return [replace(row, policy=names[row.policy, row.task]) for row in rows]
+
+
+def name_of(folder: Path, policy: str, task: str) -> str:
+    """Returns a baseline's name with those of its coefficients that are not the published ones."""
+    path = checkpoint_path(folder, policy, ALL_TASKS if policy == ONE_HOT else task)
+    given = load_checkpoint(path, kind="baseline")[1].get("coefficients", {})
+    usual = published_coefficients(policy)
+    other = [f"{key} {value:g}" for key, value in given.items() if usual[key] != value]
+    return ", ".join([policy_name(policy), *other]) if other else policy
 
 
 def read_curves(run_dir: Path, run: Key) -> list[CurveRow]:
@@ -226,16 +285,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("runs", nargs="*", type=Path, help="folders of finished runs")
     parser.add_argument("--check", action="store_true", help="check the pages, write nothing")
+    parser.add_argument(
+        "--baselines", nargs="+", type=Path, default=[], help="further baselines of these runs"
+    )
     parser.add_argument("--docs", type=Path, default=DOCS, help="folder of the pages")
     options = parser.parse_args()
-    if options.check and options.runs:
+    if options.check and (options.runs or options.baselines):
         parser.error("--check takes no runs")
     with exit_codes():
         if options.check:
             check_results_page(options.docs)
             check_weak_page(options.docs)
         else:
-            print(*publish(options.runs, options.docs), sep="\n")
+            print(*publish(options.runs, options.docs, baselines=options.baselines), sep="\n")
 
 
 if __name__ == "__main__":

@@ -185,7 +185,7 @@ def check_trained(run: Run, algorithm: str, task: str, coefficients: Coefficient
     Raises:
         ConfigError: naming the first one that differs.
     """
-    saved = load_newest(checkpoint_path(run, algorithm, task), kind="baseline")
+    saved = load_newest(checkpoint_path(run.folder, algorithm, task), kind="baseline")
     if saved is None:
         return
     now = {**published(algorithm), **coefficients}
@@ -198,10 +198,10 @@ def check_trained(run: Run, algorithm: str, task: str, coefficients: Coefficient
             )
 
 
-def checkpoint_path(run: Run, algorithm: str, task: str) -> Path:
-    """The checkpoint of a baseline."""
+def checkpoint_path(folder: Path, algorithm: str, task: str) -> Path:
+    """The checkpoint of a baseline, in a run folder."""
     name = f"{algorithm}-{task}"
-    return run.folder / BaselineSettings.folder / name / "checkpoint.safetensors"
+    return folder / BaselineSettings.folder / name / "checkpoint.safetensors"
 
 
 def one_hot_task(index: int, num_tasks: int) -> list[Transform]:
@@ -224,7 +224,7 @@ class Learner:
     def __init__(self, run: Run, algorithm: str, task: str, coefficients: Coefficients) -> None:
         self.run, self.algorithm, self.name = run, algorithm, f"{algorithm}-{task}"
         self.coefficients = dict(coefficients)
-        self.path = checkpoint_path(run, algorithm, task)
+        self.path = checkpoint_path(run.folder, algorithm, task)
         sizes, bcq = sizes_of(run.transitions(run.names[0], "train")), run.settings.bcq
         torch.manual_seed(run.seed("baselines", self.name))
         if algorithm == ONE_HOT:
