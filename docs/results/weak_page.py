@@ -121,7 +121,8 @@ def _short(rows: Sequence[ResultRow], targets: Table) -> list[str]:
     best = difference(rows, rows, BCQ, REFERENCE)
     if best is not None:
         sentences.append(
-            f"On the mean over tasks, BCQ's return is {share(best)} of the scripted optimum's."
+            f"On the mean over tasks they return {share(best)} "
+            "of what the scripted optimum returns."
         )
     if targets.rows:
         missed = [what for what, _, _, met in targets.rows if met == "no"]
