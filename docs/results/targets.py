@@ -108,14 +108,14 @@ def weak_targets_table(rows: Sequence[ResultRow], summaries: Sequence[Summary]) 
     return Table(
         title="Targets",
         caption=(
-            "BCQ over the expert: the paper's ratio of returns. Where this multiple of the "
-            "expert's return exceeds the scripted optimum's, the target is a share of the distance "
-            "from the expert's return to the scripted optimum's; the interval resamples the starts "
-            "of all three. Success and the distilled policy's share: those of the worst task, with "
-            "that task's interval. Distilled: with the source of m whose worst share of BCQ's "
-            "return is highest, the same for all tasks. Paired differences are on the same starts, "
-            "as shares of the expert's return. Significantly below means that the whole interval "
-            "is below 0."
+            "BCQ over the expert: the target is the paper's ratio of the two returns. If the "
+            "scripted optimum does not reach this multiple of the expert's return, the target is a "
+            "share of the distance from the expert's return to the scripted optimum's, and the "
+            "interval resamples the starts of all three policies. Success, and the distilled "
+            "policy's share of BCQ's return: the value and the interval of the worst task. "
+            "Distilled: one source of m for all tasks, the one whose worst share of BCQ's return "
+            "is highest. Paired differences: from the same starts, as shares of the expert's "
+            "return. A difference is significantly below 0 if its whole interval is below 0."
         ),
         header=("What", "Asked", "Measured", "Met"),
         rows=lines,

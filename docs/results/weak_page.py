@@ -120,7 +120,10 @@ def _short(rows: Sequence[ResultRow], targets: Table) -> list[str]:
         )
     best = difference(rows, rows, BCQ, REFERENCE)
     if best is not None:
-        sentences.append(f"On the mean over tasks this is {share(best)} of the scripted optimum.")
+        sentences.append(
+            f"On the mean over tasks they return {share(best)} "
+            "of what the scripted optimum returns."
+        )
     if targets.rows:
         missed = [what for what, _, _, met in targets.rows if met == "no"]
         met = f"{len(targets.rows) - len(missed)} of {len(targets.rows)} targets are met"

@@ -28,12 +28,11 @@ def returns_table(rows: Sequence[ResultRow], titles: dict[str, str]) -> Table:
         make_table(rows, 0, titles),
         title="Returns and success",
         caption=(
-            "Mean return over an episode, and success, on the same starts. Expert: the weak "
-            "expert, which acts as it demonstrates. Scripted optimum: the same controller without "
-            "noise and with default gains. Distilled: with the source of m in brackets. All "
-            "policies but these experts learn from the same demonstrations. "
-            "[baselines.md](baselines.md) describes the other algorithms. Interval: bootstrap over "
-            "the episodes of each task."
+            "Mean return of an episode, and success, on the same starts. The brackets after "
+            "Distilled contain the source of m. Expert and scripted optimum are scripted; the "
+            "other policies learn from the same demonstrations. [baselines.md](baselines.md) "
+            "describes the other algorithms. 95% interval: that of the success on all tasks, by a "
+            "bootstrap over the episodes of each task."
         ),
     )
 
@@ -55,8 +54,8 @@ def pushes_table(rows: Sequence[ResultRow]) -> Table:
     return Table(
         title="Pushes by return",
         caption=(
-            "Episodes of the pushes whose return is in an interval, and the share of them that "
-            "succeeded. Distilled: all sources of m."
+            "Number of the pushes' episodes whose return is in the interval, and the share of "
+            "these that succeeded. Distilled: all sources of m that were evaluated."
         ),
         header=("Return", "Expert", "BCQ", "Distilled"),
         rows=lines if pushes else [],
@@ -84,10 +83,10 @@ def steps_table(published: Published) -> Table:
     return Table(
         title="Presets with and without a change",
         caption=(
-            "Each line but “none” is an ablation of the preset (`recipes/config/ablation`). "
-            "Cells: mean return of BCQ and success. Share: mean over tasks of the mean return as a "
-            "share of that without the change, on the same starts and seeds, with a 95% interval "
-            "from episodes resampled in pairs within each task and seed. Starts, which no "
+            "Each line except “none” is an ablation of the preset (`recipes/config/ablation`). "
+            "Cells: mean return and success of BCQ. Share: the mean return divided by that "
+            "without the change, from the same starts and seeds, as a mean over tasks; the 95% "
+            "interval resamples pairs of episodes within each task and seed. Starts, which no "
             f"demonstration had: {kinds}. Episodes: of each task and seed."
         ),
         header=("Change", "Preset", *map(task_name, TASKS), "Share", "Seeds", "Episodes"),
@@ -101,13 +100,14 @@ def agents_table(rows: Sequence[DiagnosticsRow]) -> Table:
     return Table(
         title="Candidates and critics",
         caption=(
-            "After the last epoch of stage 1, on training demonstrations. Cells: spread ratio, "
-            "value gap, outside share. Spread ratio: the spread of the candidates over that of the "
-            "demonstrated actions; 1 for a generator that models them, near 0 for a clone. Value "
-            "gap: how much more the critics promise for the chosen action than for the "
-            "demonstrated one, in standard deviations of their values. Outside: share of the "
-            "chosen actions that are unlike the demonstrated ones; see "
-            "[diagnostics.md](diagnostics.md)."
+            "After the last epoch of stage 1, on training demonstrations. Change: the ablation. "
+            "Cells: spread ratio, value gap, outside share ([diagnostics.md](diagnostics.md)). "
+            "Spread ratio: the spread of the candidates divided by that of the demonstrated "
+            "actions; 1 if the generator models the demonstrations, near 0 if the policy clones "
+            "them. Value gap: the critics' value of the chosen action less that of the "
+            "demonstrated one, in standard deviations of the latter. Outside share: share of the "
+            "chosen actions that are farther from the candidates' mean than 99% of the "
+            "demonstrated ones."
         ),
         header=("Change", "Preset", "Seed", *map(task_name, TASKS)),
         rows=[
