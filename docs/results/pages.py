@@ -121,7 +121,11 @@ def runs_sections(runs: Sequence[RunRow], *, baselines: bool, note: str = "") ->
     """
     if not runs:
         return []
-    more = " `recipes/baselines.py` with the same settings then trains the other algorithms."
+    more = (
+        " `recipes/baselines.py` with the same settings then trains the other algorithms. With "
+        "[other coefficients](baselines.md#coefficients) it needs a further folder, which the "
+        "option `--baselines` adds to the page."
+    )
     versions: dict[str, list[str]] = {}
     for run in runs:
         commit = f"commit {run.commit}, " if run.commit else ""

@@ -90,7 +90,8 @@ def publish(
             read_agents(run_dir, run.key) if weak else [],
         )
     for key, (first, *_) in further.items():
-        raise ConfigError(f"{first} belongs to run {key} (preset, ablation, seed); valid: a run given")
+        message = f"{first} belongs to run {key} (preset, ablation, seed)"
+        raise ConfigError(f"{message}; valid: a run that is published with it")
     for folder, content in zip(folders, published, strict=True):
         write_published(folder, content)
     pages = [write_results_page(docs), write_weak_page(docs)]
