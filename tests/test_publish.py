@@ -115,7 +115,7 @@ def test_baselines_with_other_coefficients_are_named_by_them(publish: Any, tmp_p
     add_baselines(tuned, iql={"expectile": 0.5, "temperature": 3.0})
     publish.publish([run_dir], docs, baselines=[tuned])
     policies = {e.row.policy for e in read_published(docs / "results" / "weak").episodes}
-    named = {"iql", "IQL, expectile 0.5", "ReBRAC, actor_penalty 1"}
+    named = {"iql", "IQL (expectile 0.5)", "ReBRAC (actor_penalty 1)"}
     assert policies == {"expert", "bcq", *named}
     publish.check_weak_page(docs)
 

@@ -125,12 +125,12 @@ def test_a_mean_difference_whose_interval_contains_zero_is_not_met() -> None:
 
 def test_iql_with_tuned_coefficients_has_lines_of_its_own() -> None:
     rows = make_weak_rows()
-    tuned = [replace(row, policy="IQL, expectile 0.5") for row in rows if row.policy == "iql"]
+    tuned = [replace(row, policy="IQL (expectile 0.5)") for row in rows if row.policy == "iql"]
     lines = lines_of(rows + tuned)
-    added = [line.replace("IQL", "IQL, expectile 0.5") for line in LINES[-2:]]
+    added = [line.replace("IQL", "IQL (expectile 0.5)") for line in LINES[-2:]]
     assert list(lines) == LINES + added
     assert lines[added[0]]["Measured"] == lines[LINES[-2]]["Measured"]
-    others = [replace(row, policy="TD3+BC, alpha 1") for row in tuned]
+    others = [replace(row, policy="BC, best episodes (share 0.5)") for row in tuned]
     assert list(lines_of(rows + others)) == LINES
 
 

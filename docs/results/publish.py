@@ -211,7 +211,7 @@ def name_of(folder: Path, policy: str, task: str) -> str:
     given = load_checkpoint(path, kind="baseline")[1].get("coefficients", {})
     usual = published_coefficients(policy)
     other = [f"{key} {value:g}" for key, value in given.items() if usual[key] != value]
-    return ", ".join([policy_name(policy), *other]) if other else policy
+    return f"{policy_name(policy)} ({', '.join(other)})" if other else policy
 
 
 def read_curves(run_dir: Path, run: Key) -> list[CurveRow]:

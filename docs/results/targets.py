@@ -103,7 +103,7 @@ def weak_targets_table(rows: Sequence[ResultRow], summaries: Sequence[Summary]) 
         lines += success_targets(f"Distilled{name}", summaries, source)
     names = [policy_name(algorithm) for algorithm in EXCEEDED]
     for arm in arms_of(rows):
-        if policy_name(arm[0]).partition(",")[0] in names:  # coefficients follow a comma
+        if policy_name(arm[0]).partition(" (")[0] in names:  # coefficients follow in brackets
             lines += _paired_targets(rows, arm)
     return Table(
         title="Targets",

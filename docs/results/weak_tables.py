@@ -31,7 +31,8 @@ def returns_table(rows: Sequence[ResultRow], titles: dict[str, str]) -> Table:
             "Mean return of an episode, and success, on the same starts. The brackets after "
             "Distilled contain the source of m. Expert and scripted optimum are scripted; the "
             "other policies learn from the same demonstrations. [baselines.md](baselines.md) "
-            "describes the other algorithms. 95% interval: that of the success on all tasks, by a "
+            "describes the other algorithms. The brackets after their names contain the coefficients "
+            "that were [tuned](baselines.md#tuned-for-weak-demonstrations). 95% interval: that of the success on all tasks, by a "
             "bootstrap over the episodes of each task."
         ),
     )
