@@ -106,9 +106,10 @@ def in_short(
     )
 
 
-def table_section(heading: str, table: Table) -> list[Section]:
-    """Returns a section with one table; none if the table is empty."""
-    return [Section(heading=heading, tables=[table])] if table.rows else []
+def table_section(heading: str, *tables: Table) -> list[Section]:
+    """Returns a section with the tables that have rows; none if all are empty."""
+    filled = [table for table in tables if table.rows]
+    return [Section(heading=heading, tables=filled)] if filled else []
 
 
 def runs_sections(runs: Sequence[RunRow], *, baselines: bool, note: str = "") -> list[Section]:

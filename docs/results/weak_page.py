@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from comparisons import (
@@ -28,7 +29,7 @@ from pages import (
 )
 from published import TASKS, WEAK, Published, RunRow, read_published
 from targets import best_source, weak_targets_table
-from weak_tables import agents_table, pushes_table, returns_table, steps_table
+from weak_tables import agents_table, pushes_table, returns_table, stages_table, steps_table
 
 from torchrl_bmrl.evaluation.results import ResultRow, Summary, summarise
 from torchrl_bmrl.reports import Section, results_table, task_name
@@ -50,7 +51,7 @@ def make_weak_page(published: Published) -> Page:
     alone = not all(run.evaluated for run in published.runs)
     sections = [
         *_main_sections(rows, summaries, runs),
-        *table_section("Ablations of stage 1", steps),
+        *_ablations(steps),
         *table_section("Diagnostics of stage 1", agents),
         Section(heading="How the settings were chosen", paragraphs=[prose("weak_tried")]),
         *runs_sections(
@@ -86,6 +87,12 @@ def check_weak_page(folder: Path) -> None:
         check_page(folder / "weak.md", make_weak_page(published))
 
 
+def _ablations(steps: Table) -> list[Section]:
+    """The table of ablations below what it shows."""
+    sections = table_section("Ablations of stage 1", steps)
+    return [replace(section, paragraphs=[prose("weak_ablations")]) for section in sections]
+
+
 def _main_sections(
     rows: Sequence[ResultRow], summaries: Sequence[Summary], runs: Sequence[RunRow]
 ) -> list[Section]:
@@ -104,7 +111,7 @@ def _main_sections(
             paragraphs=_short(rows, targets),
         ),
         Section(heading="Every policy and task", tables=[returns_table(rows, TITLES)]),
-        *table_section("Paired differences", make_paired_table(rows, TITLES)),
+        *table_section("Paired differences", make_paired_table(rows, TITLES), stages_table(rows)),
         *table_section("Where the pushes fall short", pushes_table(rows)),
     ]
 

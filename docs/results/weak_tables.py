@@ -8,11 +8,13 @@ from itertools import pairwise
 from statistics import fmean
 
 import numpy as np
-from comparisons import BCQ, difference, share
+from comparisons import BCQ, arms_of, baselines_of, difference, share, signed
 from published import TASKS, WEAK_PRESETS, CurveRow, DiagnosticsRow, Published
+from targets import best_source
 
+from torchrl_bmrl.evaluation import paired_difference
 from torchrl_bmrl.evaluation.results import ResultRow
-from torchrl_bmrl.reports.tables import MISSING, Table, percent, task_name
+from torchrl_bmrl.reports.tables import MISSING, Table, percent, policy_name, task_name
 from torchrl_bmrl.studies.baselines_report import make_table
 
 Change = tuple[str, str]
@@ -31,10 +33,33 @@ def returns_table(rows: Sequence[ResultRow], titles: dict[str, str]) -> Table:
             "Mean return of an episode, and success, on the same starts. The brackets after "
             "Distilled contain the source of m. Expert and scripted optimum are scripted; the "
             "other policies learn from the same demonstrations. [baselines.md](baselines.md) "
-            "describes the other algorithms. The brackets after their names contain the coefficients "
-            "that were [tuned](baselines.md#tuned-for-weak-demonstrations). 95% interval: that of the success on all tasks, by a "
+            "describes the other algorithms. The brackets after their names contain the "
+            "coefficients that were [tuned](baselines.md#tuned-for-weak-demonstrations). 95% "
+            "interval: that of the success on all tasks, by a "
             "bootstrap over the episodes of each task."
         ),
+    )
+
+
+def stages_table(rows: Sequence[ResultRow]) -> Table:
+    """Compares both stages with every other algorithm, start by start."""
+    ours = [arm for arm in (BCQ, best_source(rows)) if arm is not None and arm in arms_of(rows)]
+    lines = []
+    for arm in ours:
+        for other in baselines_of(rows):
+            cells = []
+            for tasks in (TASKS, *([task] for task in TASKS)):
+                found = paired_difference(rows, arm, other, tasks)
+                cells.append(MISSING if found is None else signed(found))
+            lines.append((policy_name(arm[0]), policy_name(other[0]), *cells))
+    return Table(
+        title="Both stages less each other algorithm",
+        caption=(
+            "As in the table above. Distilled: with the source of m of the targets. Intervals that "
+            "contain 0 do not tell which policy returns more."
+        ),
+        header=("Policy", "Less", "Mean over tasks", *map(task_name, TASKS)),
+        rows=lines,
     )
 
 
