@@ -139,6 +139,14 @@ def test_baselines_of_no_run_and_those_that_are_there_already_are_refused(
     assert not (tmp_path / "docs").exists()
 
 
+def test_baselines_of_a_run_without_an_evaluation_are_refused(publish: Any, tmp_path: Path) -> None:
+    run_dir = stage_1_folder(tmp_path / "run", "preset=weak", "ablation=dim4")
+    tuned = make_folder(tmp_path / "tuned", "preset=weak", "ablation=dim4")
+    add_baselines(tuned, iql={"expectile": 0.5})
+    with pytest.raises(ConfigError, match="published with it and was evaluated"):
+        publish.publish([run_dir], tmp_path / "docs", baselines=[tuned])
+
+
 def test_a_baseline_without_its_checkpoint_is_refused(publish: Any, tmp_path: Path) -> None:
     run_dir = make_folder(tmp_path / "run", "preset=paper")
     add_baselines(run_dir, iql={})

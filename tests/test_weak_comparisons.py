@@ -13,6 +13,7 @@ from published_data import DOCS
 from weak_data import make_weak, make_weak_rows
 
 # isort: split
+from pages import TITLES
 from published import TASKS, WEAK, read_published
 from weak_page import make_weak_page
 from weak_tables import stages_table
@@ -47,11 +48,29 @@ def test_the_readmes_gains_over_the_demonstrators_are_those_of_the_published_run
 
 def test_the_readmes_algorithms_return_less_on_the_mean_over_tasks() -> None:
     assert "both return more than BC, IQL, TD3+BC and ReBRAC do" in readme()
-    table = stages_table(rows_of_page())
-    for policy in ("BCQ", "Distilled"):
-        lines = {line[1].partition(" (")[0]: line[2] for line in table.rows if line[0] == policy}
-        for name in ("BC", "IQL", "TD3+BC", "ReBRAC"):
-            assert float(lines[name].partition("[")[2].partition(",")[0]) > 0.0
+    table = stages_table(rows_of_page(), TITLES)
+    compared = {(line[0].partition(" (")[0], line[1].partition(" (")[0]) for line in table.rows}
+    algorithms = ("BC", "BC, best episodes", "IQL", "TD3+BC", "ReBRAC")
+    assert compared == {(policy, name) for policy in ("BCQ", "Distilled") for name in algorithms}
+    for line in table.rows:
+        assert float(line[2].partition("[")[2].partition(",")[0]) > 0.0, line
+
+
+def test_the_differences_on_the_page_of_baselines_are_those_of_the_published_runs() -> None:
+    lines = stages_table(rows_of_page(), TITLES).rows
+    shares = {
+        line[1]: f"{float(line[2].partition('%')[0]):.0f}%" for line in lines if line[0] == "BCQ"
+    }
+    text = " ".join((DOCS / "baselines.md").read_text(encoding="utf-8").split())
+    assert (
+        f"the differences are {shares['BC']} to BC, "
+        f"{shares['BC, best episodes (share 0.5)']} to BC of the best episodes, "
+        f"{shares['IQL']} to IQL ({shares['IQL (expectile 0.5)']} to IQL with tuned coefficients"
+    ) in text
+    assert (
+        f"{shares['TD3+BC (alpha 1)']} to TD3+BC and "
+        f"{shares['ReBRAC (actor_penalty 0.3)']} to ReBRAC"
+    ) in text
 
 
 def test_both_stages_are_compared_with_every_other_algorithm_start_by_start() -> None:
@@ -61,13 +80,13 @@ def test_both_stages_are_compared_with_every_other_algorithm_start_by_start() ->
         mine = [r for r in rows if (r.policy, r.task) == (policy, "reach")]
         return np.array([r.episode_return for r in mine])
 
-    table = stages_table(rows)
+    table = stages_table(rows, TITLES)
     assert [line[:2] for line in table.rows] == [
-        (policy, other) for policy in ("BCQ", "Distilled") for other in ("BC", "IQL")
+        (policy, other) for other in ("BC", "IQL") for policy in ("BCQ", "Distilled (prototype)")
     ]
-    column = table.header.index("Reach")
-    for line, other in zip(table.rows, ("bc", "iql"), strict=False):
+    column = table.header.index(TITLES["reach"])
+    for line, other in zip(table.rows[::2], ("bc", "iql"), strict=True):
         share = (returns("bcq").mean() - returns(other).mean()) / returns("expert").mean()
         assert line[column].startswith(f"{share:+.1%} [")
     assert "### Both stages less each other algorithm" in make_weak_page(make_weak()).text
-    assert not stages_table([row for row in rows if row.policy not in ("bc", "iql")]).rows
+    assert not stages_table([r for r in rows if r.policy not in ("bc", "iql")], TITLES).rows

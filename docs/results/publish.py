@@ -85,13 +85,13 @@ def publish(
         weak = run.preset in WEAK_PRESETS
         published[weak] = published[weak].with_run(
             run,
-            read_episodes(run_dir, run, further.pop(run.key, [])),
+            read_episodes(run_dir, run, further.pop(run.key, []) if run.evaluated else []),
             read_curves(run_dir, run.key),
             read_agents(run_dir, run.key) if weak else [],
         )
     for key, (first, *_) in further.items():
         message = f"{first} belongs to run {key} (preset, ablation, seed)"
-        raise ConfigError(f"{message}; valid: a run that is published with it")
+        raise ConfigError(f"{message}; valid: one that is published with it and was evaluated")
     for folder, content in zip(folders, published, strict=True):
         write_published(folder, content)
     pages = [write_results_page(docs), write_weak_page(docs)]
@@ -210,7 +210,7 @@ def name_of(folder: Path, policy: str, task: str) -> str:
     path = checkpoint_path(folder, policy, ALL_TASKS if policy == ONE_HOT else task)
     given = load_checkpoint(path, kind="baseline")[1].get("coefficients", {})
     usual = published_coefficients(policy)
-    other = [f"{key} {value:g}" for key, value in given.items() if usual[key] != value]
+    other = [f"{key} {value:g}" for key, value in given.items() if usual.get(key) != value]
     return f"{policy_name(policy)} ({', '.join(other)})" if other else policy
 
 

@@ -111,7 +111,9 @@ def _main_sections(
             paragraphs=_short(rows, targets),
         ),
         Section(heading="Every policy and task", tables=[returns_table(rows, TITLES)]),
-        *table_section("Paired differences", make_paired_table(rows, TITLES), stages_table(rows)),
+        *table_section(
+            "Paired differences", make_paired_table(rows, TITLES), stages_table(rows, TITLES)
+        ),
         *table_section("Where the pushes fall short", pushes_table(rows)),
     ]
 

@@ -8,14 +8,13 @@ from itertools import pairwise
 from statistics import fmean
 
 import numpy as np
-from comparisons import BCQ, arms_of, baselines_of, difference, share, signed
+from comparisons import BCQ, arms_of, baselines_of, difference, share
 from published import TASKS, WEAK_PRESETS, CurveRow, DiagnosticsRow, Published
 from targets import best_source
 
-from torchrl_bmrl.evaluation import paired_difference
 from torchrl_bmrl.evaluation.results import ResultRow
-from torchrl_bmrl.reports.tables import MISSING, Table, percent, policy_name, task_name
-from torchrl_bmrl.studies.baselines_report import make_table
+from torchrl_bmrl.reports.tables import MISSING, Table, percent, task_name
+from torchrl_bmrl.studies.baselines_report import make_paired_table, make_table
 
 Change = tuple[str, str]
 """Preset and ablation."""
@@ -41,25 +40,17 @@ def returns_table(rows: Sequence[ResultRow], titles: dict[str, str]) -> Table:
     )
 
 
-def stages_table(rows: Sequence[ResultRow]) -> Table:
-    """Compares both stages with every other algorithm, start by start."""
-    ours = [arm for arm in (BCQ, best_source(rows)) if arm is not None and arm in arms_of(rows)]
-    lines = []
-    for arm in ours:
-        for other in baselines_of(rows):
-            cells = []
-            for tasks in (TASKS, *([task] for task in TASKS)):
-                found = paired_difference(rows, arm, other, tasks)
-                cells.append(MISSING if found is None else signed(found))
-            lines.append((policy_name(arm[0]), policy_name(other[0]), *cells))
-    return Table(
+def stages_table(rows: Sequence[ResultRow], titles: dict[str, str]) -> Table:
+    """Both stages less every other algorithm, start by start."""
+    stages = [arm for arm in (BCQ, best_source(rows)) if arm in arms_of(rows)]
+    others = [name for name, _ in baselines_of(rows)]
+    return replace(
+        make_paired_table(rows, titles, policies=stages, references=others),
         title="Both stages less each other algorithm",
         caption=(
             "As in the table above. Distilled: with the source of m of the targets. Intervals that "
             "contain 0 do not tell which policy returns more."
         ),
-        header=("Policy", "Less", "Mean over tasks", *map(task_name, TASKS)),
-        rows=lines,
     )
 
 

@@ -75,18 +75,26 @@ def make_table(
     )
 
 
-def make_paired_table(rows: Sequence[ResultRow], titles: Mapping[str, str]) -> Table:
+def make_paired_table(
+    rows: Sequence[ResultRow],
+    titles: Mapping[str, str],
+    *,
+    policies: Sequence[Arm] | None = None,
+    references: Sequence[str] = REFERENCES,
+) -> Table:
     """Each policy less each reference, on the same starts: mean over tasks, and task by task.
 
     Args:
         rows: episodes of the policies and of the expert, of one run or of several with different
             seeds.
         titles: of the tasks by name, in the order of the columns.
+        policies: policies and their sources of m; ``None`` for all.
+        references: names of the policies to which they are compared.
     """
     columns, arms = _columns(rows, titles), _arms(rows)
     lines = []
-    for reference in [(name, "") for name in REFERENCES if (name, "") in arms]:
-        for arm in arms:
+    for reference in [(name, "") for name in references if (name, "") in arms]:
+        for arm in arms if policies is None else policies:
             if arm in (EXPERT, reference):
                 continue
             cells = [
