@@ -30,7 +30,7 @@ COVERED = 0.9
 """Share of the distance from expert to scripted optimum that is asked for where the paper's ratio
 is out of reach."""
 EXCEEDED = ("bc", "iql")
-"""Algorithms that BCQ should exceed on weak demonstrations, with published and tuned coefficients."""
+"""Algorithms that BCQ should exceed on weak demonstrations, with whatever coefficients."""
 
 Target = tuple[str, str, str, str]
 """What is measured, what was asked for, the measured number, and whether it is met."""
