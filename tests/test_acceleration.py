@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -66,6 +69,22 @@ def no_warning() -> Iterator[None]:
 @pytest.mark.parametrize("hard_reset", [True, False])
 def test_a_few_steps_after_hard_and_soft_resets_equal_stock(hard_reset: bool) -> None:
     assert_same_episodes(*both("Lift", "Panda", hard_reset=hard_reset), steps=6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kernels", [None, "Nehalem"])
+def test_steps_equal_stock_whatever_linear_algebra_kernels_the_processor_gets(
+    kernels: str | None,
+) -> None:
+    # OpenBLAS chooses its kernels by the processor, or by this variable. They add in other orders.
+    test = "test_a_few_steps_after_hard_and_soft_resets_equal_stock"
+    env = {name: x for name, x in os.environ.items() if not name.startswith("OPENBLAS_")}
+    env |= {"OPENBLAS_CORETYPE": kernels} if kernels else {}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"]
+    done = subprocess.run(
+        [*command, f"{__file__}::{test}"], env=env, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.slow

@@ -153,7 +153,7 @@ def sweep(cwd: Path, *overrides: str) -> tuple[int, str, set[str]]:
     done = subprocess.run(
         [sys.executable, "failing.py", "--multirun", *overrides],
         cwd=cwd,
-        env=os.environ | {"PYTHONPATH": path},
+        env=os.environ | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"},
         capture_output=True,
         text=True,
         timeout=600,

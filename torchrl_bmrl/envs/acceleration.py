@@ -217,6 +217,6 @@ class _Memory:
         accelerations, buffer = self.accelerations, velocities.buf
         accelerations[:, 0] = robot.recent_ee_acc[name].current
         accelerations[:, 1:] = (robot.control_freq * (buffer[1:] - buffer[:-1])).T
-        # np.convolve of ten with ten is one scalar product; a matrix product rounds differently.
-        average = np.array([np.dot(axis, _AVERAGE) for axis in accelerations])
+        # As np.convolve sums them; the order in a scalar product depends on the processor.
+        average = np.array([np.correlate(axis, _AVERAGE)[0] for axis in accelerations])
         robot.recent_ee_acc[name].push(average)
