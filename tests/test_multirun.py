@@ -146,14 +146,14 @@ if __name__ == "__main__":
 """Fails in ways that its seed decides."""
 
 
-def sweep(cwd: Path, *overrides: str) -> tuple[int, str, set[str]]:
+def sweep(cwd: Path, *overrides: str, **variables: str) -> tuple[int, str, set[str]]:
     """Exit code of a sweep, what it says, and the files of the jobs that went well."""
     (cwd / "failing.py").write_text(RECIPE)
     path = os.pathsep.join(filter(None, [str(RECIPES), os.environ.get("PYTHONPATH")]))
     done = subprocess.run(
         [sys.executable, "failing.py", "--multirun", *overrides],
         cwd=cwd,
-        env=os.environ | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"},
+        env=os.environ | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"} | variables,
         capture_output=True,
         text=True,
         timeout=600,
@@ -181,7 +181,7 @@ def test_every_job_that_fails_is_named_and_the_others_are_done(
     options = ["seed=0,1,2,3,4", "run_dir=1.10", *LAUNCHERS[launcher]]
     code, said, files = sweep(tmp_path, *options)
     assert code == 1
-    assert files == {"1.10-0", "1.10-2", "1.10-4"}
+    assert files == {"1.10-0", "1.10-2", "1.10-4"}, said
     lines = said.partition("2 of 5 jobs failed; the others are done:\n")[2].splitlines()
     assert lines[:2] == ["seed=1 run_dir='1.10'", "    error: no seed for me"]
     assert lines[2:4] == ["seed=3 run_dir='1.10'", "    Traceback (most recent call last):"]
@@ -196,11 +196,22 @@ def test_jobs_that_failed_are_named_though_another_ones_process_was_killed(
     pytest.importorskip(f"hydra_plugins.hydra_{launcher}_launcher")
     options = ["seed=0,1,5", "run_dir=x", *LAUNCHERS[launcher]]
     code, said, files = sweep(tmp_path, *options)
-    assert (code, files) == (1, {"x-0"})
+    assert (code, files) == (1, {"x-0"}), said
     lines = said.partition("2 of 3 jobs failed; the others are done:\n")[2].splitlines()
     assert lines[:3] == ["seed=1 run_dir=x", "    error: no seed for me", "seed=5 run_dir=x"]
     assert lines[3].startswith("    not finished: ")
     assert "Traceback" not in said
+
+
+@pytest.mark.slow
+def test_ray_starts_on_this_machine_whatever_address_a_killed_cluster_left(tmp_path: Path) -> None:
+    pytest.importorskip("hydra_plugins.hydra_ray_launcher")
+    with tempfile.TemporaryDirectory(prefix="ray-", dir="/tmp") as folder:  # a short path
+        (Path(folder) / "ray").mkdir()
+        (Path(folder) / "ray" / "ray_current_cluster").write_text("127.0.0.1:9")
+        options = ["seed=0,2", "run_dir=x", *LAUNCHERS["ray"]]
+        code, said, files = sweep(tmp_path, *options, RAY_TMPDIR=folder)
+    assert (code, files) == (0, {"x-0", "x-2"}), said
 
 
 @pytest.mark.slow
