@@ -200,8 +200,8 @@ def stage_agreement(
 ) -> Estimate:
     """Adjusted mutual information of groups and recorded phases.
 
-    It is 1 if either determines the other and 0 on average if they are independent, for any number
-    and size of groups. It does not depend on the groups' numbering.
+    It is 1 if groups and phases are the same division and 0 on average if they are independent, for
+    any number and size of groups. It does not depend on the groups' numbering.
 
     Args:
         stage: Group of each transition, shape ``(N,)``.

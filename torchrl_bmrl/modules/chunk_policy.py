@@ -23,7 +23,7 @@ class ChunkPolicy(TensorDictModuleBase):
 
     Args:
         policy: writes chunks: ``size`` actions one after the other in the last dimension.
-        size: actions of a chunk.
+        size: number of actions in a chunk.
 
     Keyword Args:
         action_key, chunk_key, step_key: names of the entries that it writes.

@@ -38,20 +38,20 @@ def _embed(demonstration: TensorDictBase, encoder: TensorDictModule) -> Tensor:
 
 
 class DemonstrationTaskLatent(PrototypeTaskLatent):
-    """Writes the embeddings of one demonstration.
+    """Writes the embedding of one of a demonstration's transitions at each step.
 
     If the demonstration has ``stage (T,)``, a composition's number of finished tasks, the transform
-    also reads the episode's ``stage (*B,)``, and in each stage uses the demonstration's transitions
-    of that stage (of its last one for stages that it lacks).
+    also reads the episode's ``stage (*B,)``. It then uses the demonstration's transitions of that
+    stage, or of the demonstration's last stage if it lacks that one.
 
     Args:
         demonstration: the demonstration's transitions, batch size ``(T,)``, with the keys of
             :data:`TRANSITION_KEYS`.
         encoder: :func:`make_task_encoder`'s module, trained.
-        alignment: ``"time"``: one transition for each step in the stage, then the stage's last one;
+        alignment: ``"time"``: the next transition at each step, at last the stage's last one;
             ``"state"``: the transition with the nearest observation; ``"progress"``: the transition
             whose embedding is nearest to that of the episode's last transition, at most ``window``
-            ahead of the present one. ``"time"`` does not wait for a slowed arm, ``"progress"``
+            ahead of the current one. ``"time"`` does not wait for a slowed arm, ``"progress"``
             does.
         window: transitions that ``"progress"`` may advance in one step.
 

@@ -24,7 +24,7 @@ from torchrl_bmrl.ownership import check_trained
 
 
 class DiscreteBCQPolicy(LossPolicy):
-    r"""The most valuable of the actions that are likely enough.
+    r"""Chooses the action with the highest value among those that are likely enough.
 
     .. math:: \pi(s) = \arg\max_a \{Q_1(s, a) : G(a|s) / \max_{a'} G(a'|s) > \tau\}
 

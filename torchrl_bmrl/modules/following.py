@@ -85,13 +85,13 @@ class LossPolicy(TensorDictModuleBase):
         """The policy that a loss trains, for hooks, collectors and evaluation during training.
 
         It shares the loss's parameters, so ``update_policy_weights_()`` of a collector sends the
-        present ones. A copy of it, as in a worker's process, is independent.
+        current ones. A copy of the policy, as in a worker's process, is independent.
 
         Args:
             loss: a loss of the policy's algorithm. A ``BCQPolicy`` also takes other losses with a
                 generator and critics; of a
-                :class:`~torchrl_bmrl.objectives.MetaDistillationLoss` the student acts, which reads
-                ``task_latent``.
+                :class:`~torchrl_bmrl.objectives.MetaDistillationLoss` it is the student's policy,
+                which reads ``task_latent``.
             **options: of the policy, such as ``num_candidates``.
 
         Raises:
@@ -136,7 +136,7 @@ class LossPolicy(TensorDictModuleBase):
         return self
 
     def follow(self) -> None:
-        """Updates a live policy to the present parameters of its loss.
+        """Updates a live policy to the current parameters of its loss.
 
         Every call of the policy does this, and so does the loss when it moves to another device or
         dtype, or when parameters or coefficients are replaced. A frozen policy does not change.

@@ -18,7 +18,7 @@ def task_latent_box(task_latent: Tensor, *, share: float = 0.98) -> tuple[Tensor
 
     Args:
         task_latent: embeddings of the training transitions, ``(N, m)``.
-        share: of the embeddings, in each coordinate; the rest is cut off equally on both sides.
+        share: share of the embeddings in each coordinate; both ends lose half of the rest.
 
     Returns:
         lower and upper corner, ``(m,)`` each.
@@ -51,15 +51,15 @@ class HeldTaskLatent(Transform):
               R_t = \sum_{i=0}^{n-1} r_{t+i},\quad n \le k
 
     One step of the transformed environment is one decision: ``action`` is m, the policy acts on
-    each new observation, and the decision's reward is the plain sum of the steps' rewards. The
-    hold ends early where the episode does, with the observation that it ended on. An agent that
+    each new observation, and the decision's reward is the plain sum of the steps' rewards. If
+    the episode ends earlier, so does the hold, with the episode's last observation. An agent that
     discounts a step by γ discounts a decision by :math:`\gamma^k`.
 
     (``FrameSkipTransform`` repeats an action and ``MultiAction`` takes several actions chosen in
     advance; here the policy sees every step.)
 
     Transforms before it act on every step, those after it on every decision. Batched environments
-    step all episodes, also those that have ended within the hold; these results are discarded.
+    also step the episodes that have ended within the hold, and discard these results.
 
     Reference: *Compositional Skill Learning Using Batch Meta RL*, section 7.5.
 

@@ -62,7 +62,7 @@ class ActionMixture(LatentGenerator):
     with :math:`\sigma_k \ge` ``min_scale``, since the likelihood of actions at a bound would have
     no maximum. Of a latent z, the first number chooses the component (by its share of the normal
     distribution), and the others are the deviation from its mean. The action is clamped to the
-    bounds. All candidates of a state cost one call of the network.
+    bounds. All candidates of a state need only one call of the network.
 
     Reference: Bishop, *Mixture Density Networks*, 1994,
     https://publications.aston.ac.uk/id/eprint/373/.
@@ -72,7 +72,7 @@ class ActionMixture(LatentGenerator):
         action_dim: size of the action; z has one number more.
 
     Keyword Args:
-        num_components: Gaussians, K.
+        num_components: number of Gaussians.
         min_scale: smallest standard deviation, in units of half the action's range.
         num_cells: widths of the hidden layers.
         bounds: lower and upper bound of the action, numbers or ``(action_dim,)``.

@@ -30,7 +30,7 @@ PERTURBATION = ("max_perturbation", "action_low", "action_high")
 
 
 class BCQPolicy(LossPolicy):
-    r"""The best of many proposed actions.
+    r"""Chooses the action with the highest value among many proposals.
 
     .. math:: \pi(s) = a_{i^*},\quad i^* = \arg\max_i Q_1(s, a_i),\quad
               a_i = G(s, z_i) + \phi\, h\, \xi(s, G(s, z_i))
@@ -39,7 +39,7 @@ class BCQPolicy(LossPolicy):
     gives the policy an :class:`EnsembleCritic` in place of :math:`Q_1`. Reference: *Compositional
     Skill Learning Using Batch Meta RL*, eq. 2, section 7.1.
 
-    It is used in stage 1 and stage 2: if the generator and the critic read ``task_latent``, so does
+    It acts in stage 1 and in stage 2: if the generator and the critic read ``task_latent``, so does
     the policy. Proposals are drawn from PyTorch's global generator at every call, whatever the
     exploration type is. :meth:`~LossPolicy.live` and :meth:`~LossPolicy.frozen` make the policy of
     a loss.
@@ -59,7 +59,7 @@ class BCQPolicy(LossPolicy):
         action_key, action_latent_key, perturbation_key, state_action_value_key: names of these
             entries in the networks.
 
-    Keys read: what the networks read beside what they write, such as ``observation (*B, obs_dim)``
+    Keys read: what the networks read and do not write, such as ``observation (*B, obs_dim)``
     and ``task_latent (*B, m)``. Key written: ``action (*B, action_dim)``. A call with keywords,
     ``policy(observation=observation)``, returns the action.
 
@@ -158,7 +158,7 @@ class BCQPolicy(LossPolicy):
         return tensordict.set(self.keys.action, self.choose(proposals))
 
     def choose(self, proposals: TensorDictBase) -> Tensor:
-        """The most valuable of proposed actions, after the policy's perturbation.
+        """The action with the highest value among proposals, after the policy's perturbation.
 
         Args:
             proposals: batch ``[*B, N]`` with the state and the action, as :meth:`propose` returns
@@ -213,7 +213,7 @@ class PLASPolicy(LossPolicy):
         bounds: of the action, needed for a perturbation network; by default the decoder's.
         action_key, action_latent_key, perturbation_key: names of these entries in the networks.
 
-    Keys read: what the networks read beside what they write, such as ``observation (*B, obs_dim)``.
+    Keys read: what the networks read and do not write, such as ``observation (*B, obs_dim)``.
     Key written: ``action (*B, action_dim)``. A call with keywords returns the action.
 
     Raises:

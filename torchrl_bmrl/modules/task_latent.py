@@ -221,7 +221,7 @@ class OnlineTaskLatent(PrototypeTaskLatent):
 
 
 class StageTaskLatent(PrototypeTaskLatent):
-    """Writes the point of the present stage, as an oracle that knows the task index does.
+    """Writes the point of the current stage, as an oracle that knows the task index does.
 
     It reads ``stage (*B,)``, the number of finished stages.
 

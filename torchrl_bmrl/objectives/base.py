@@ -28,8 +28,8 @@ class KeyedLoss(LossModule):
     """Base of all losses: keys, coefficients, calls of the networks, and the reduction.
 
     A subclass lists the keys that it reads and writes (:meth:`read_keys`, :meth:`written_keys`)
-    and calls :meth:`keep_keys` at the end of its ``__init__``. Where its ``__init__`` takes
-    ``**options`` for its base, ``inspect.signature`` of the class shows the base's options, too.
+    and calls :meth:`keep_keys` at the end of its ``__init__``. If its ``__init__`` takes
+    ``**options`` for its base, ``inspect.signature`` of the class also shows the base's options.
 
     Keyword Args:
         reduction: ``"mean"``, ``"sum"`` or ``"none"``; ``None`` means ``"mean"``.
@@ -270,7 +270,7 @@ class KeyedLoss(LossModule):
             raise BMRLError(self._left_behind)
 
     def readers(self, key: NestedKey) -> list[str]:
-        """Names of the networks that read a key, now or after the step.
+        """Names of the networks that read a key, under ``"next"`` or not.
 
         Args:
             key: of an entry.
@@ -305,9 +305,9 @@ class KeyedLoss(LossModule):
 
         Args:
             name: the network, such as ``"qvalue_network"``.
-            target: whether those of its target network.
-            frozen: whether without a gradient into them. Otherwise they receive the gradients
-                that the network's own loss sends, see ``separate_losses``.
+            target: whether to return those of its target network.
+            frozen: whether they receive no gradient. Otherwise they receive the gradients that
+                the network's own loss sends, see ``separate_losses``.
         """
         attribute = f"target_{name}_params" if target else f"{name}_params"
         shared = self._shared_with_generator.get(attribute, []) if self.separate_losses else []
@@ -332,7 +332,7 @@ class KeyedLoss(LossModule):
             name: the network, such as ``"qvalue_network"``.
             tensordict: what it reads; its output is added.
             target: whether the target network runs.
-            frozen: whether without a gradient into its parameters, see :meth:`weights`.
+            frozen: whether its parameters receive no gradient, see :meth:`weights`.
 
         Raises:
             BMRLError: if the data do not fit the network.

@@ -53,7 +53,7 @@ class BCQLoss(GenerativeLoss):
       best-of-N over a flow, as in Q-chunking, https://arxiv.org/abs/2507.07969, there with chunks
       of actions.
 
-    :meth:`forward` computes all of them with the present parameters. To follow the published order,
+    :meth:`forward` computes all losses with the current parameters. To follow the published order,
     call the three methods one after the other and step each optimizer in between. The generator has
     no target. :class:`~torchrl.objectives.SoftUpdate` or :class:`~torchrl.objectives.HardUpdate`
     updates the other targets.
@@ -66,12 +66,12 @@ class BCQLoss(GenerativeLoss):
         perturbation_network: optional module (observation, action → ``perturbation`` in [-1, 1]).
 
     Keyword Args:
-        num_qvalue_nets: number of critics; ``None`` for 2 from a single one, or the list's length.
+        num_qvalue_nets: number of critics; ``None``: 2 from a single critic, or the list's length.
         num_candidates: actions proposed per next state.
-        lmbda: λ, weight of the critics' minimum against their maximum.
+        lmbda: λ, weight of the critics' minimum; the weight of their maximum is 1 - λ.
         target_rule: how the critics value the next state's actions: ``"clipped"``, by λ as above
             (1 is the minimum), or ``"mean"``, by their mean.
-        acting_rule: how they value actions in the policy and in the perturbation's loss: by the
+        acting_rule: how critics value actions in the policy and in the perturbation's loss: by the
             ``"first"`` critic as above, or by the ``"mean"`` or the ``"min"`` over all.
         latent_clip: bound on the latent of proposed actions; ``None`` for none.
         value_bounds: ``(low, high)`` that the next states' value is clamped to; ``None`` for none.

@@ -37,8 +37,8 @@ class OfflineLoss(KeyedLoss):
 
     It provides the critics (:meth:`convert_critics`, :meth:`qvalue`), the value estimators
     (:meth:`temporal_difference`), and checked access to the data (:meth:`rows`). A subclass names
-    its losses in ``terms``, in update order: the term ``"actor"`` is computed by the method
-    ``actor_loss``, which returns it with a dict of metrics, and returned as ``loss_actor``.
+    its losses in ``terms``, in update order. The method ``actor_loss`` computes the term
+    ``"actor"`` and returns it with a dict of metrics; the output has it as ``loss_actor``.
 
     Keyword Args:
         gamma: discount of the default TD(0) estimator.
@@ -175,7 +175,7 @@ class OfflineLoss(KeyedLoss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Computes every term with the present parameters, and writes the priority to the input."""
+        """Computes every term with the current parameters, and writes the priority to the input."""
         losses: dict[str, Tensor] = {}
         metrics: dict[str, Tensor] = {}
         for term in self.terms:
@@ -210,8 +210,8 @@ class OfflineLoss(KeyedLoss):
         Args:
             tensordict: what they read, batch ``[*B]``.
             key: the output.
-            target: whether with the targets' parameters.
-            frozen: whether without a gradient into their parameters.
+            target: whether the targets' parameters are used.
+            frozen: whether their parameters receive no gradient.
 
         Raises:
             BMRLError: if the data do not fit the critics, or these do not write the key.
@@ -250,8 +250,8 @@ class OfflineLoss(KeyedLoss):
 
         Args:
             tensordict: what the critics read, batch ``[*B]``.
-            target: whether with the targets' parameters.
-            frozen: whether without a gradient into their parameters.
+            target: whether the targets' parameters are used.
+            frozen: whether their parameters receive no gradient.
 
         Raises:
             BMRLError: if the critics' output is not ``(*B, 1)``.
@@ -386,7 +386,7 @@ class OfflineLoss(KeyedLoss):
         Args:
             tensordict: the data.
             keys: of the entries, as networks read them.
-            after: whether those under ``"next"``; they are returned without that prefix.
+            after: whether to return those under ``"next"``, without that prefix.
 
         Raises:
             BMRLError: for a missing key, a number that is not finite, or another batch shape.

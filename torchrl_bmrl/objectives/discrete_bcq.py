@@ -45,8 +45,8 @@ class DiscreteBCQLoss(OfflineLoss):
        :math:`y = r + \gamma (1 - \mathrm{terminated}) \min_j Q'_j(s', a')`,
        :math:`a' = \arg\max_{a} \{\min_j Q_j(s', a) : G(a|s') / \max_{a} G(a|s') > \tau\}`
 
-    With one critic this is the published algorithm (Double DQN within the likely actions); of
-    several the minimum counts.
+    With one critic this is the published algorithm (Double DQN within the likely actions); with
+    several critics, their minimum counts.
 
     Args:
         generator: classifier of the data's actions (observation → ``logits (*B, n)``).
@@ -56,7 +56,7 @@ class DiscreteBCQLoss(OfflineLoss):
         action_space: format of ``action``: ``"one-hot"`` (or ``"one_hot"``), ``(*B, n)``, as
             :class:`~torchrl.envs.GymEnv` has it, ``"categorical"``, ``(*B,)`` or ``(*B, 1)``, or
             the action's spec, :class:`~torchrl.data.OneHot` or :class:`~torchrl.data.Categorical`.
-        num_qvalue_nets: number of critics; ``None`` for 1 from a single one, or the list's length.
+        num_qvalue_nets: number of critics; ``None``: 1 from a single critic, or the list's length.
         threshold: τ. 0 is Double DQN, 1 is imitation.
         logits_weight: w.
         loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"`` (Huber) between value and target.
@@ -182,7 +182,7 @@ class DiscreteBCQLoss(OfflineLoss):
 
         Args:
             tensordict: the data.
-            after: whether at the next state.
+            after: whether to return those of the next state.
 
         Raises:
             BMRLError: if the action's spec knows another number of actions.
@@ -203,8 +203,8 @@ class DiscreteBCQLoss(OfflineLoss):
 
         Args:
             tensordict: what the critics read, batch ``[*B]``.
-            target: whether with the targets' parameters.
-            frozen: whether without a gradient into their parameters.
+            target: whether the targets' parameters are used.
+            frozen: whether their parameters receive no gradient.
         """
         key = self.tensor_keys.action_value
         return self.evaluate(tensordict, key, target=target, frozen=frozen)

@@ -51,13 +51,13 @@ class MetaDistillationLoss(KeyedLoss):
     \mu_i)/\sigma_i` and ``context``; docs/distillation.md explains them. The last three terms
     are off by default: in the triplet loss (https://arxiv.org/abs/1909.11373) :math:`m^+` embeds
     another transition of the task and :math:`m^-` one of another task; the isometry term makes
-    distances in m those of reward and teacher's action c, over all pairs of a task's rows; the
-    advantage term compares the values of two latents of a state, by whose differences alone a
-    policy chooses.
+    distances in m equal those in c, the reward and the teacher's action, over all pairs of a task's
+    rows; the advantage term compares the values of two latents of a state, since a policy chooses
+    only by such differences.
     :math:`\hat Q` is trained at :math:`\hat g` without a gradient into the student's generator.
 
-    The teachers are frozen: row i of the data is task i. Those of equal shapes run as one batched
-    ensemble. A perturbation network is not distilled.
+    The teachers are frozen. Row i of the data belongs to task i. Teachers of equal shapes run as
+    one batched ensemble. A perturbation network is not distilled.
 
     Args:
         task_encoder: M, (observation, action, next reward, next observation) → ``task_latent``.

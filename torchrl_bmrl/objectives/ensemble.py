@@ -38,8 +38,8 @@ def can_stack(critics: Sequence[TensorDictModule], others: Iterable[nn.Parameter
     """Whether the parameters of critics can be stacked into one set, as TorchRL does.
 
     Stacking makes new parameters of one structure. So critics that differ, share parameters (with
-    each other, with another network or within themselves) or are lazy cannot be stacked; and of a
-    list of one TorchRL would make no parameters at all.
+    each other, with another network or within themselves) or are lazy cannot be stacked; and from
+    a list with one critic TorchRL would make no parameters at all.
 
     Args:
         critics: the critics.
@@ -139,7 +139,7 @@ class FrozenEnsemble(nn.Module):
 
 
 def kind(module: nn.Module) -> str:
-    """Everything that a module is beside its parameters: structure, shapes, plain attributes."""
+    """What defines a module besides its parameters: structure, shapes, plain attributes."""
     shapes = [tuple(value.shape) for value in module.state_dict().values()]
     attributes = [
         {name: _whole(value) for name, value in vars(part).items() if _is_choice(name, value)}

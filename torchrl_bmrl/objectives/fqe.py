@@ -53,7 +53,7 @@ class FQELoss(OfflineLoss):
             is not accepted.
 
     Keyword Args:
-        num_qvalue_nets: number of critics; ``None`` for 1 from a single one, or the list's length.
+        num_qvalue_nets: number of critics; ``None``: 1 from a single critic, or the list's length.
         **options: of :class:`~torchrl_bmrl.objectives.OfflineLoss`, such as ``gamma`` and
             ``loss_function``. Without a generator ``separate_losses`` has no effect.
 
@@ -139,7 +139,7 @@ class FQELoss(OfflineLoss):
 
         Args:
             observation: what policy and critics read of a state, batch ``[*B]``.
-            target: whether with the targets' parameters.
+            target: whether the targets' parameters are used.
 
         Raises:
             BMRLError: if the policy writes no action, or the state does not fit the networks.

@@ -175,7 +175,7 @@ class GenerativeLoss(OfflineLoss):
     # -- proposed actions ------------------------------------------------------------------------
 
     def propose(self, observation: TensorDictBase, num_candidates: int) -> TensorDictBase:
-        """The observation with proposed actions, each from a draw of its own.
+        """The observation with proposed actions, each drawn independently.
 
         The generator receives no gradient.
 
@@ -255,7 +255,7 @@ class GenerativeLoss(OfflineLoss):
 
         Args:
             tensordict: observation and action, batch ``[*B]``.
-            target: whether by the network's target.
+            target: whether the target network is used.
 
         Raises:
             BMRLError: if the perturbation has another shape than the action.

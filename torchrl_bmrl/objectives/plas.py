@@ -20,7 +20,7 @@ class PLASLoss(GenerativeLoss):
     r"""Policy in the Latent Action Space.
 
     A deterministic policy :math:`\pi` chooses the latent of a conditional variational autoencoder
-    :math:`G` of the data's actions. So every action that it chooses is one that the data support.
+    :math:`G` of the data's actions. It therefore chooses only actions that the data support.
 
     Reference: Zhou et al., *PLAS: Latent Action Space for Offline Reinforcement Learning*, CoRL
     2020, https://arxiv.org/abs/2011.07213, algorithm 1.
@@ -38,8 +38,8 @@ class PLASLoss(GenerativeLoss):
     With a ``perturbation_network`` every decoded action :math:`a` becomes
     :math:`a + \phi\, h\, \xi(s, a)`, and the actor's loss trains :math:`\xi` too.
 
-    As published, the generator is trained first, alone, and then frozen: call
-    :meth:`generator_loss` for a while, and then the two others. The policy and the critics have
+    As published, the generator is first trained alone and then frozen: call only
+    :meth:`generator_loss` at first, and then only the two others. The policy and the critics have
     targets, the generator has none.
 
     Args:
@@ -51,8 +51,8 @@ class PLASLoss(GenerativeLoss):
         perturbation_network: optional module (observation, action → ``perturbation`` in [-1, 1]).
 
     Keyword Args:
-        num_qvalue_nets: number of critics; ``None`` for 2 from a single one, or the list's length.
-        lmbda: λ, weight of the critics' minimum against their maximum.
+        num_qvalue_nets: number of critics; ``None``: 2 from a single critic, or the list's length.
+        lmbda: λ, weight of the critics' minimum; the weight of their maximum is 1 - λ.
         **options: as for :class:`~torchrl_bmrl.objectives.BCQLoss`, but no ``latent_clip``.
 
     Keys read and written: as :class:`~torchrl_bmrl.objectives.BCQLoss`.

@@ -38,7 +38,7 @@ class ReBRACLoss(OfflineLoss):
        where n is the mean of :math:`|\min_j Q_j(s, \pi(s))|` over the batch, without gradient
 
     As published, the critics have layer normalisation, and :meth:`actor_loss` is minimised and the
-    targets are stepped only at every second update. The defaults of the penalties are a start: the
+    targets are stepped only at every second update. The default penalties are where to start: the
     authors tune both for each data set. Their grid for MuJoCo and Adroit
     (https://github.com/DT6A/ReBRAC) is β₁ in 0.001, 0.01, 0.05, 0.1 and β₂ in 0, 0.001, 0.01, 0.1,
     0.5.
@@ -51,7 +51,7 @@ class ReBRACLoss(OfflineLoss):
     Keyword Args:
         action_spec: bounded spec of the action. Exclusive with ``bounds``.
         bounds: ``(low, high)`` of the action. Exclusive with ``action_spec``.
-        num_qvalue_nets: number of critics; ``None`` for 2 from a single one, or the list's length.
+        num_qvalue_nets: number of critics; ``None``: 2 from a single critic, or the list's length.
         actor_penalty: β₁.
         critic_penalty: β₂.
         normalise_q: whether the actor's value is divided by n; if not, n is 1.
@@ -161,7 +161,7 @@ class ReBRACLoss(OfflineLoss):
         return self.temporal_difference(tensordict, predicted, next_value)
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Penalty of the policy's action, less its value; only the actor receives gradients.
+        """Penalty on the policy's action minus its value; only the actor receives gradients.
 
         Returns:
             the loss, and no metrics.

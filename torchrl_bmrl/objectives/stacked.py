@@ -48,7 +48,7 @@ def _of_members(name: str, doc: str) -> Any:
 class StackedLoss(LossModule):
     """N losses of one kind; member i reads row i of the data and has its own parameters.
 
-    It is used like one of them. ``forward`` takes a batch ``[N, *B]``. If the members reduce their
+    Use it like a single loss. ``forward`` takes a batch ``[N, *B]``. If the members reduce their
     losses, it returns each ``loss_*`` summed over the members, so that one ``backward()`` gives
     each member its own gradient, and every metric of each member, ``[N]``. The methods
     ``generator_loss``, ``qvalue_loss``, ... return the losses and metrics of each member, ``[N]``.
@@ -244,7 +244,7 @@ class StackedLoss(LossModule):
         return super()._apply(fn)
 
     def member(self, index: int) -> LossModule:
-        """One of the given losses, with its present parameters.
+        """One of the given losses, with its current parameters.
 
         Args:
             index: its position.

@@ -40,7 +40,7 @@ def advantage(
     target: Tensor,
     m: Tensor,
 ) -> Tensor:
-    """Error of each row's difference in value to another latent's, ``(num_tasks, B)``.
+    """Error of each row's difference in value between its latent and another, ``(num_tasks, B)``.
 
     Args:
         loss: the loss.

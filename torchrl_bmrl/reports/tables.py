@@ -216,8 +216,8 @@ def stages_table(
         title="Stages found without labels",
         caption=(
             "Adjusted mutual information of the groups that a mixture of Gaussians finds in a "
-            "task's transitions and the phases that the expert recorded: 1 if either determines "
-            "the other, 0 by chance. There are as many groups as phases. They are fitted to the "
+            "task's transitions and the phases that the expert recorded: 1 if both divide them "
+            "alike, 0 by chance. There are as many groups as phases. They are fitted to the "
             "training demonstrations and measured on the held-out ones, on each successful "
             "episode until half a second after its first success. Brackets contain 95% bootstrap "
             "intervals over episodes. For comparison: the same number for the encoder's input "
