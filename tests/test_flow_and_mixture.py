@@ -220,6 +220,13 @@ def test_bcq_over_them_takes_no_option_of_an_autoencoder_and_draws_unclipped_lat
 
 
 @each
+def test_a_policy_over_them_has_no_bound_on_the_latent_and_refuses_one(make: Any) -> None:
+    assert BCQPolicy(make(*DIMS), make_critics(1)[0]).latent_clip is None  # as it acts
+    with pytest.raises(BMRLError, match=r"latent_clip is 0\.3, and generator .*; valid: None"):
+        BCQPolicy(make(*DIMS), make_critics(1)[0], latent_clip=0.3)
+
+
+@each
 def test_policies_of_the_loss_and_of_the_decoder_choose_the_same_actions(make: Any) -> None:
     loss = BCQLoss(make(*DIMS).double(), make_critics(2), **BOUNDS)
     state = TensorDict({"observation": torch.randn(6, OBSERVATION_DIM).double()}, [6])
