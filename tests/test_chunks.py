@@ -55,6 +55,22 @@ def test_rows_with_too_few_steps_left_are_dropped_unless_the_episode_terminates(
     assert data["next", "terminated"].flatten().tolist() == [0, 0, 1, 1, 1, 1, 1]
 
 
+def test_data_without_any_chunk_are_refused_by_the_size() -> None:
+    with pytest.raises(BMRLError, match="size is 6, and the longest episode has 5 steps; valid"):
+        ActionChunks(6, gamma=0.5)(episodes(5, 2))
+
+
+def test_a_policy_that_writes_another_action_is_refused_by_its_keys() -> None:
+    inner = TensorDictModule(nn.Identity(), ["observation"], [("agent", "move")])
+    state = TensorDict({"observation": torch.zeros(2, 4)}, [2])
+    with pytest.raises(BMRLError, match=r"the policy writes \[\('agent', 'move'\)\], not 'action'"):
+        ChunkPolicy(inner, 2)(state)
+    assert ChunkPolicy(inner, 2, action_key=("agent", "move"))(state)["agent", "move"].shape == (
+        2,
+        2,
+    )
+
+
 def test_chunks_of_one_action_change_nothing() -> None:
     before = episodes(3, 2)
     data = ActionChunks(1, gamma=0.5)(before)

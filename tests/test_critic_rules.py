@@ -16,7 +16,8 @@ from helpers import (
     transitions,
 )
 from tensordict import TensorDict
-from torch import Tensor
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from torchrl_bmrl.errors import UnknownNameError
@@ -136,6 +137,35 @@ def test_a_student_learns_the_value_by_the_rule_of_its_teacher() -> None:
     for rule in ("mean", "min"):
         torch.testing.assert_close(error(rule, equal=True), error("first", equal=True))
         assert error(rule, equal=False) != error("first", equal=False)
+
+
+class _TwoOutputs(nn.Module):
+    """A critic that also returns its features, before the value."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.features, self.value = MLP(sum(DIMS), 4, num_cells=[8]), nn.Linear(4, 1)
+
+    def forward(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        features = self.features(observation, action)
+        return features, self.value(features)
+
+
+@pytest.mark.parametrize("key", ["state_action_value", ("points", "all")])
+@each
+def test_the_value_is_the_output_of_the_loss_s_key_wherever_it_stands(rule: str, key: Any) -> None:
+    critics = [
+        TensorDictModule(_TwoOutputs(), ["observation", "action"], ["features", key]).double()
+        for _ in range(3)
+    ]
+    loss = BCQLoss(ActionVAE(*DIMS).double(), critics, **BOUNDS, acting_rule=rule)
+    loss.set_keys(state_action_value=key)
+    torch.manual_seed(0)
+    proposed = loss.propose(states(), 5)
+    best = RULES[rule](loss.qvalue(proposed)).argmax(-1)
+    torch.manual_seed(0)
+    chosen = BCQPolicy.live(loss, num_candidates=5)(states())["action"]
+    torch.testing.assert_close(chosen, proposed["action"][torch.arange(6), best])
 
 
 def test_unknown_rules_are_refused_by_name() -> None:

@@ -9,7 +9,7 @@ import torch
 from helpers import refused
 from tensordict import TensorDict
 
-from torchrl_bmrl.data import best_episodes, make_replay_buffer, with_next_action
+from torchrl_bmrl.data import NStep, best_episodes, make_replay_buffer, with_next_action
 
 
 def episodes(*lengths: int, terminated: tuple[int, ...] = (), rewards: Any = None) -> TensorDict:
@@ -57,6 +57,27 @@ def test_an_episode_cut_off_without_a_flag_ends_where_its_number_changes() -> No
     data = episodes(2, 2)
     data["next", "done"][:] = False
     assert pairs(with_next_action(data)) == [(0, 1), (2, 3)]
+
+
+def test_an_episode_that_lost_its_last_step_ends_before_it_for_n_steps_too() -> None:
+    """Without a number of the episode, only its flags tell where it ends."""
+    data = episodes(4, 3, terminated=(1,), rewards=[1.0] * 7).exclude("episode")
+    after = data["next"]
+    after["truncated"] = after["done"] & ~after["terminated"]
+    pairs_of_actions = with_next_action(data)
+    assert pairs_of_actions["next", "done"].flatten().tolist() == [0, 0, 1, 0, 0, 1]
+    assert pairs_of_actions["next", "truncated"].flatten().tolist() == [0, 0, 1, 0, 0, 0]
+    assert not after["done"][2]  # the given data stay
+    n_step = NStep(3, gamma=1.0)(pairs_of_actions)
+    assert n_step["next", "reward"].flatten().tolist() == [3, 2, 1, 3, 2, 1]
+    assert n_step["next", "action"].flatten().tolist() == [3, 3, 3, 6, 6, 6]
+
+
+@pytest.mark.parametrize("change", [with_next_action, best_episodes])
+def test_rows_of_several_steps_are_refused(change: Any) -> None:
+    """The next action would be one too early, and a return would count rewards repeatedly."""
+    with refused("the data have 'steps_to_next_obs' already; valid: transitions of one step"):
+        change(NStep(2, gamma=1.0)(episodes(3, 3)))
 
 
 def test_the_given_data_do_not_change() -> None:

@@ -263,6 +263,19 @@ def test_batches_of_any_shape_give_the_same_diagnostics() -> None:
     assert diagnose(loss, data.reshape(8, 64)) == expected
 
 
+@pytest.mark.parametrize("key", [("collector", "mask"), "mask"])
+def test_padded_rows_do_not_count(key: Any) -> None:
+    loss, data = autoencoder(), demonstrations(scale=0.5)
+    loss.loss_mask_key = key
+    expected = diagnose(loss, data[:300])
+    padded = data.clone()
+    for entry in ("observation", "action"):
+        padded[entry][300:] = math.nan
+    padded[key] = torch.arange(len(data)) < 300
+    assert diagnose(loss, padded) == expected
+    assert diagnose(loss, padded.reshape(8, 64)) == expected
+
+
 # -- files and messages ----------------------------------------------------------------------------
 
 
@@ -312,5 +325,9 @@ def test_messages_name_all_agents_of_a_finding_once_and_what_to_do() -> None:
         "pull: most chosen actions are unlike the demonstrations (outside_share 0.70, above 0.5)"
     )
     assert "fewer candidates (evaluate.num_candidates" in outside_message(found)
+    for message in (collapse_message(found), outside_message(found)):  # the others refuse them
+        advice = message.partition("with the autoencoder")[2]
+        assert "bcq.kl_weight" in advice
+        assert "bcq.latent_clip" in advice
     healthy = {"lift": make(0.9)}
     assert collapse_message(healthy) == outside_message(healthy) == ""

@@ -40,6 +40,7 @@ from torchrl_bmrl.modules import (
     ActionFlow,
     ActionMixture,
     BCQPolicy,
+    ChunkPolicy,
     DiscreteBCQPolicy,
     PLASPolicy,
     make_qvalue_network,
@@ -359,10 +360,15 @@ def refused() -> dict[str, tuple[Callable[[], Any], dict[str, Any], str]]:
             "scale is .*inf.*; valid: finite numbers above 0",
         ),
         "latent": (lambda: BCQPolicy(NoLatent(), critic), {}, "NoLatent has no 'decode'"),
+        "chunks": (
+            lambda: ChunkPolicy(bcq(), 2),
+            {},
+            "ChunkPolicy remembers .*; valid: its policy",
+        ),
     }
 
 
-@pytest.mark.parametrize("case", ["half", "key", "zero", "infinite", "latent"])
+@pytest.mark.parametrize("case", ["half", "key", "zero", "infinite", "latent", "chunks"])
 def test_what_cannot_be_written_is_refused(case: str, tmp_path: Path) -> None:
     make, options, message = refused()[case]
     with pytest.raises(BMRLError, match=message):

@@ -113,6 +113,21 @@ def test_actions_lie_within_the_bounds_and_depend_on_the_latent_alone(make: Any)
 
 
 @each
+def test_a_dimension_with_equal_bounds_is_constant_and_disturbs_no_other(make: Any) -> None:
+    low, high = torch.tensor([-1.0, 0.3]), torch.tensor([1.0, 0.3])
+    generator = make(1, 2, bounds=(low, high), num_cells=(8,))
+    action = torch.stack([torch.linspace(-1.0, 1.0, 8), torch.full((8,), 0.3)], -1)
+    data = TensorDict({"observation": torch.randn(8, 1), "action": action}, [8])
+    loss, _ = generator.row_loss(data, ActionKeys())
+    loss.mean().backward()
+    assert loss.isfinite().all()
+    assert all(p.grad.isfinite().all() for p in generator.parameters())
+    proposed = generator.propose(data.select("observation"), 5, ActionKeys())["action"]
+    assert (proposed[..., 1] == low[1]).all()
+    assert proposed[..., 0].std() > 0
+
+
+@each
 def test_candidates_are_decoded_as_single_actions_are(make: Any) -> None:
     generator = make(*DIMS)
     state = TensorDict({"observation": torch.randn(6, OBSERVATION_DIM)}, [6])
@@ -202,6 +217,13 @@ def test_bcq_over_them_takes_no_option_of_an_autoencoder_and_draws_unclipped_lat
     for option in ({"kl_weight": 0.1}, {"latent_clip": 1.0}):
         with pytest.raises(BMRLError, match=f"{next(iter(option))} is .* does not take it"):
             BCQLoss(make(*DIMS), make_critics(2), **BOUNDS, **option)
+
+
+@each
+def test_a_policy_over_them_has_no_bound_on_the_latent_and_refuses_one(make: Any) -> None:
+    assert BCQPolicy(make(*DIMS), make_critics(1)[0]).latent_clip is None  # as it acts
+    with pytest.raises(BMRLError, match=r"latent_clip is 0\.3, and generator .*; valid: None"):
+        BCQPolicy(make(*DIMS), make_critics(1)[0], latent_clip=0.3)
 
 
 @each

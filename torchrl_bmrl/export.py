@@ -22,7 +22,7 @@ from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.generators import candidates
-from torchrl_bmrl.modules import BCQPolicy, DiscreteBCQPolicy, PLASPolicy
+from torchrl_bmrl.modules import BCQPolicy, ChunkPolicy, DiscreteBCQPolicy, PLASPolicy
 
 
 def export_policy(
@@ -62,8 +62,8 @@ def export_policy(
 
     Raises:
         BMRLError: if only one of ``loc`` and ``scale`` is given, the scale is not finite and
-            positive, the policy does not read ``observation_key``, the example lacks a key, or the
-            generator's actions are not a function of a latent.
+            positive, the policy does not read ``observation_key`` or plays chunks, the example
+            lacks a key, or the generator's actions are not a function of a latent.
         MissingExtraError: without the packages that write ONNX.
 
     Example:
@@ -139,6 +139,11 @@ class _Acting(nn.Module):
             raise BMRLError(
                 f"observation_key is {observation_key!r}; valid: keys of the policy, "
                 f"{policy.in_keys}"
+            )
+        if isinstance(policy, ChunkPolicy):
+            raise BMRLError(
+                "a ChunkPolicy remembers its chunk between calls, which a file cannot; valid: its "
+                "policy, whose action is the whole chunk"
             )
         self.policy = deepcopy(policy).cpu().eval().requires_grad_(False)
         self.observation_key = observation_key

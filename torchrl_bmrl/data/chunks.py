@@ -10,6 +10,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_bmrl.data.n_step import STEPS_KEY, NStep, rows_later
+from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.objectives.data import missing
 
 
@@ -64,7 +65,7 @@ class ActionChunks(nn.Module):
             ``steps_to_next_obs``.
 
         Raises:
-            BMRLError: as :class:`NStep`, and for data without the action.
+            BMRLError: as :class:`NStep`, and for data without the action, or without any chunk.
         """
         data, size = self.outcome(tensordict), self.outcome.n_steps
         action = data.get(self.action_key, None)
@@ -75,4 +76,9 @@ class ActionChunks(nn.Module):
         whole = steps == size
         if (terminated := data.get(self.outcome.terminated_key, None)) is not None:
             whole = whole | terminated[..., 0]
+        if not whole.any():
+            raise BMRLError(
+                f"size is {size}, and the longest episode has {int(steps.max())} steps; valid: a "
+                "size of at most that"
+            )
         return data.set(self.action_key, torch.cat(parts, -1))[whole]

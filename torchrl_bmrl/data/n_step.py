@@ -106,8 +106,7 @@ class NStep(nn.Module):
         if not tensordict.batch_dims or not tensordict.batch_size.numel():
             size = list(tensordict.batch_size)
             raise BMRLError(f"the data have the batch size {size}; valid: [*B, T] with T >= 1")
-        if tensordict.get(STEPS_KEY, None) is not None:
-            raise BMRLError(f"the data have {STEPS_KEY!r} already; valid: transitions of one step")
+        check_single_steps(tensordict)
         data = tensordict.copy()
         ends = episode_ends(data, self.done_key, self.terminated_key)
         # gamma ** i is a Python number: rewards keep their dtype, and float64 its precision.
@@ -128,6 +127,16 @@ class NStep(nn.Module):
         data.set("next", after[rows_later(steps - 1)])
         data.set(self.reward_key, reward.unsqueeze(-1))
         return data.set(STEPS_KEY, steps.unsqueeze(-1))
+
+
+def check_single_steps(data: TensorDictBase) -> None:
+    """Checks that rows are transitions of one step.
+
+    Raises:
+        BMRLError: for data with ``steps_to_next_obs``.
+    """
+    if data.get(STEPS_KEY, None) is not None:
+        raise BMRLError(f"the data have {STEPS_KEY!r} already; valid: transitions of one step")
 
 
 def episode_ends(

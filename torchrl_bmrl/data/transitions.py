@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
-from torchrl_bmrl.data.n_step import episode_ends
+from torchrl_bmrl.data.n_step import check_single_steps, episode_ends
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.objectives.checks import check_number
 from torchrl_bmrl.objectives.data import missing, next_key
@@ -18,20 +18,21 @@ def with_next_action(data: TensorDictBase, action_key: NestedKey = "action") -> 
     The last transition of an episode has no next action. If it is a termination, it stays, with its
     own action as the next one: no target reads it, because there is no next value. Otherwise
     (a truncation, or the end of the data) its target would need the missing action, so the
-    transition is left out. Its observation stays as the next one of the transition before it.
+    transition is left out. Its observation stays as the next one of the transition before it, which
+    is marked as done and truncated: the episode is cut off there now.
 
     Args:
-        data: transitions in order of time, ``[N]``, with ``("next", "done")`` and, where there are
-            terminations, ``("next", "terminated")``, ``(N, 1)``. Episodes end as for
-            :class:`NStep`.
+        data: transitions of one step in order of time, ``[N]``, with ``("next", "done")`` and,
+            where there are terminations, ``("next", "terminated")``, ``(N, 1)``. Episodes end as
+            for :class:`NStep`.
         action_key: the action, ``(N, action_dim)``.
 
     Returns:
         a copy, ``[M]``, with at most N transitions.
 
     Raises:
-        BMRLError: for data of another batch size, without action or flags, or in which no
-            transition has a next action.
+        BMRLError: for data of another batch size, of n steps, without action or flags, or in which
+            no transition has a next action.
 
     Example:
         >>> from tensordict import TensorDict
@@ -46,6 +47,7 @@ def with_next_action(data: TensorDictBase, action_key: NestedKey = "action") -> 
     if data.batch_dims != 1 or not len(data):
         size = list(data.batch_size)
         raise BMRLError(f"the data have the batch size {size}; valid: [N] with N >= 1")
+    check_single_steps(data)
     action = data.get(action_key, None)
     if action is None:
         raise missing(data, action_key)
@@ -58,6 +60,11 @@ def with_next_action(data: TensorDictBase, action_key: NestedKey = "action") -> 
     rows = torch.arange(len(data), device=action.device)
     data = data.copy()
     data.set(next_key(action_key), action[rows + (~last).to(rows)])
+    cut = torch.zeros_like(kept)
+    cut[:-1] = ~last[:-1] & ~kept[1:]
+    for key in (("next", "done"), ("next", "truncated")):
+        if (flag := data.get(key, None)) is not None:
+            data.set(key, flag | cut.unsqueeze(-1))
     return data[kept]
 
 
@@ -68,7 +75,8 @@ def best_episodes(data: TensorDictBase, share: float = 0.1) -> TensorDictBase:
     whose baseline %BC clones the best episodes.
 
     Args:
-        data: transitions ``[N]`` with ``episode (N,)`` and ``("next", "reward") (N, 1)``.
+        data: transitions of one step, ``[N]``, with ``episode (N,)`` and ``("next", "reward")
+            (N, 1)``.
         share: share of the episodes to select; at least one is. Of equal returns the earlier
             episodes are selected.
 
@@ -76,7 +84,7 @@ def best_episodes(data: TensorDictBase, share: float = 0.1) -> TensorDictBase:
         their transitions, in the order of the data.
 
     Raises:
-        BMRLError: for a share outside [0, 1], or without ``episode`` or reward.
+        BMRLError: for a share outside [0, 1], data of n steps, or without ``episode`` or reward.
 
     Example:
         >>> from tensordict import TensorDict
@@ -86,6 +94,7 @@ def best_episodes(data: TensorDictBase, share: float = 0.1) -> TensorDictBase:
         [1]
     """
     share = check_number("share", share, 0.0, 1.0)
+    check_single_steps(data)  # sums of n rewards would count a reward up to n times
     for key in ("episode", ("next", "reward")):
         if data.get(key, None) is None:
             raise missing(data, key)

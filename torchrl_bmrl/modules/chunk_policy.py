@@ -34,7 +34,8 @@ class ChunkPolicy(TensorDictModuleBase):
     actions that were played.
 
     Raises:
-        BMRLError: for a size below one; and at a call if it does not divide the policy's action.
+        BMRLError: for a size below one; and at a call if the policy does not write ``action_key``,
+            or the size does not divide its action.
 
     Example:
         >>> from tensordict import TensorDict
@@ -83,7 +84,12 @@ class ChunkPolicy(TensorDictModuleBase):
 
     def _next_chunk(self, tensordict: TensorDictBase) -> torch.Tensor:
         """The policy's chunk for the present state, ``(*B, size, action_dim)``."""
-        actions = self.policy(tensordict.select(*self.in_keys)).get(self.action_key)
+        actions = self.policy(tensordict.select(*self.in_keys)).get(self.action_key, None)
+        if actions is None:
+            raise BMRLError(
+                f"the policy writes {list(self.policy.out_keys)}, not {self.action_key!r}; valid: "
+                "action_key of the policy's action"
+            )
         if actions.shape[-1] % self.size:
             raise BMRLError(
                 f"the policy writes {self.action_key!r} with {actions.shape[-1]} numbers; valid: a "

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import nn
 
 from torchrl_bmrl.functional import ensemble_value
@@ -19,9 +20,9 @@ class EnsembleCritic(TensorDictModuleBase):
     acts with it.
 
     Args:
-        critics: networks with equal keys, such as :func:`make_qvalue_network` returns; the first of
-            ``out_keys`` is the value.
+        critics: networks with equal keys, such as :func:`make_qvalue_network` returns.
         rule: of :func:`torchrl_bmrl.functional.ensemble_value`.
+        key: of the value, one of ``out_keys``; ``None`` for the first of them.
 
     Reads what the critics read, batch ``[*B]``, and writes their value, ``(*B, 1)``.
 
@@ -34,11 +35,14 @@ class EnsembleCritic(TensorDictModuleBase):
         torch.Size([5, 1])
     """
 
-    def __init__(self, critics: Sequence[TensorDictModule], rule: str) -> None:
+    def __init__(
+        self, critics: Sequence[TensorDictModule], rule: str, key: NestedKey | None = None
+    ) -> None:
         super().__init__()
         self.critics = nn.ModuleList(critics)
         self.rule = rule
-        self.in_keys, self.out_keys = list(critics[0].in_keys), list(critics[0].out_keys[:1])
+        self.in_keys = list(critics[0].in_keys)
+        self.out_keys = [critics[0].out_keys[0] if key is None else key]
         self.sizes = dict(getattr(critics[0], "sizes", {}))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

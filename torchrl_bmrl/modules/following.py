@@ -205,7 +205,7 @@ def _module(loss: Any, name: str, critic: str | None) -> Any:
         return loss.critic(0)[0]
     # Copies: critics whose parameters are stacked share one module.
     critics = [deepcopy(loss.critic(i)[0]) for i in range(loss.num_qvalue_nets)]
-    return EnsembleCritic(critics, critic)
+    return EnsembleCritic(critics, critic, loss.tensor_keys.state_action_value)
 
 
 def _params(loss: Any, name: str, critic: str | None) -> TensorDictBase:

@@ -186,8 +186,9 @@ class BoundedModule(nn.Module):
         return self.low + (self.high - self.low) * (0.5 * (unit.clamp(-1.0, 1.0) + 1.0))
 
     def unscaled(self, action: Tensor) -> Tensor:
-        """Maps the bounds to [-1, 1]."""
-        return 2.0 * (action - self.low) / (self.high - self.low) - 1.0
+        """Maps the bounds to [-1, 1], and a dimension whose bounds are equal to -1."""
+        span = self.high - self.low
+        return 2.0 * (action - self.low) / torch.where(span > 0, span, 1.0) - 1.0
 
 
 class _BoundedDecoder(BoundedModule):

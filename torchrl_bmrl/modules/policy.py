@@ -27,6 +27,8 @@ from torchrl_bmrl.ownership import check_trained
 
 PERTURBATION = ("max_perturbation", "action_low", "action_high")
 """Coefficients and buffers of a loss that a perturbation needs."""
+LATENT_CLIP = 0.5
+"""Bound on the latent of an autoencoder by default."""
 
 
 class BCQPolicy(LossPolicy):
@@ -53,7 +55,8 @@ class BCQPolicy(LossPolicy):
     Keyword Args:
         latent_dim: size of ``action_latent``; needed for a decoder that does not declare it.
         num_candidates: proposals per state.
-        latent_clip: bound on the latent, ``None`` for none.
+        latent_clip: bound on the latent, ``None`` for none. A generator without this option has
+            none; for its decoder alone pass ``None``.
         max_perturbation: φ.
         bounds: of the action, needed for a perturbation network; by default the generator's.
         action_key, action_latent_key, perturbation_key, state_action_value_key: names of these
@@ -65,7 +68,8 @@ class BCQPolicy(LossPolicy):
 
     Raises:
         BMRLError: for candidates below one, a latent size or bounds that are not the generator's or
-            missing, or a critic that a loss has copied and trains elsewhere.
+            missing, a ``latent_clip`` that the generator does not take, or a critic that a loss has
+            copied and trains elsewhere.
 
     Example:
         >>> from tensordict import TensorDict
@@ -88,7 +92,7 @@ class BCQPolicy(LossPolicy):
         *,
         latent_dim: int | None = None,
         num_candidates: int = 100,
-        latent_clip: float | None = 0.5,
+        latent_clip: float | None = LATENT_CLIP,
         max_perturbation: float = 0.05,
         bounds: tuple[float | Tensor, float | Tensor] | None = None,
         action_key: NestedKey = "action",
@@ -108,7 +112,7 @@ class BCQPolicy(LossPolicy):
         self.keys = ActionKeys(action=action_key, action_latent=action_latent_key)
         self.latent_dim = _latent_dim(generator, latent_dim, action_latent_key)
         self.num_candidates = num_candidates
-        self.latent_clip = latent_clip
+        self.latent_clip = _latent_clip(generator, latent_clip)
         self.max_perturbation = max_perturbation
         _register_bounds(self, generator, perturbation_network, bounds)
         self.perturbation_key = perturbation_key
@@ -297,6 +301,18 @@ def _latent_dim(generator: Any, given: int | None, key: NestedKey) -> Any:
     if None not in (given, own) and given != own:
         raise BMRLError(f"latent_dim is {given}; valid: {own}, the generator's")
     return own if given is None else given
+
+
+def _latent_clip(generator: Any, given: float | None) -> float | None:
+    """The bound on the latent, ``None`` for a generator that has no such option."""
+    if not hasattr(generator, "propose") or "latent_clip" in generator.options:
+        return given
+    if given not in (None, LATENT_CLIP):
+        raise BMRLError(
+            f"latent_clip is {given!r}, and generator {type(generator).__name__} does not take it; "
+            "valid: None"
+        )
+    return None
 
 
 def _register_bounds(policy: Any, generator: Any, perturbation: Any, given: Any) -> None:

@@ -120,7 +120,7 @@ def diagnose(loss: BCQLoss, data: TensorDictBase, *, num_candidates: int = 100) 
     Args:
         loss: an agent, with any generator; for one of a stack, ``stack.member(index)``.
         data: demonstrations, batch ``[*B]``, with the action and the entries of a state that the
-            loss reads.
+            loss reads. Rows that a mask marks as padding do not count.
         num_candidates: candidates among which the policy chooses.
 
     Example:
@@ -134,8 +134,10 @@ def diagnose(loss: BCQLoss, data: TensorDictBase, *, num_candidates: int = 100) 
         >>> seen.collapsed, len(seen.latent_kl)  # untrained, it ignores its noise
         (True, 4)
     """
-    key = loss.tensor_keys.action
-    action, states = data.get(key).flatten(0, -2), data.reshape(-1).select(*loss.observation_keys)
+    key, data = loss.tensor_keys.action, data.reshape(-1)
+    if (valid := loss.valid_rows(data, data.batch_size)) is not None:
+        data = data[valid]
+    action, states = data.get(key), data.select(*loss.observation_keys)
     half = (loss.action_high - loss.action_low) / 2
     half = torch.where(half > 0, half, 1.0)
     with torch.random.fork_rng([action.device] if action.device.type == "cuda" else []):
@@ -253,8 +255,8 @@ def collapse_message(found: Mapping[str, Diagnostics]) -> str:
         {name: x.spread_ratio for name, x in found.items() if x.collapsed},
         "the candidates of {names} vary less than the demonstrations (spread_ratio {span}, below "
         f"{COLLAPSED}), so these policies clone; to improve on the demonstrations try "
-        "bcq.generator=gaussian, mixture or flow, or a lower bcq.kl_weight and "
-        "bcq.latent_clip=null",
+        "bcq.generator=gaussian, mixture or flow, or, with the autoencoder, a lower bcq.kl_weight "
+        "and bcq.latent_clip=null",
     )
 
 
@@ -272,7 +274,8 @@ def outside_message(found: Mapping[str, Diagnostics]) -> str:
         {name: x.outside_share for name, x in found.items() if x.outside},
         "{names}: most chosen actions are unlike the demonstrations (outside_share {span}, above "
         f"{OUTSIDE}), so the critics may be fooled; try fewer candidates (evaluate.num_candidates, "
-        "bcq.num_candidates) or a narrower generator (a higher bcq.kl_weight, bcq.latent_clip=0.5)",
+        "bcq.num_candidates) or a narrower generator (with the autoencoder a higher bcq.kl_weight, "
+        "bcq.latent_clip=0.5)",
     )
 
 
