@@ -222,3 +222,16 @@ def test_steps_and_chunks_together_are_refused() -> None:
     settings = Settings(bcq=BCQSettings(n_steps=2, action_chunk=3))
     with pytest.raises(ConfigError, match=r"bcq.n_steps is 2 and bcq.action_chunk 3; valid: one"):
         settings.check()
+
+
+@pytest.mark.parametrize("generator", ["flow", "mixture", "gaussian"])
+@pytest.mark.parametrize(
+    "option", [{"kl_weight": 0.1}, {"kl_reduction": "sum"}, {"latent_clip": None}], ids=list
+)
+def test_settings_that_the_generator_does_not_read_are_refused_before_anything_is_recorded(
+    generator: str, option: dict[str, Any]
+) -> None:
+    ((name, value),) = option.items()
+    Settings(bcq=BCQSettings(**option)).check()
+    with pytest.raises(ConfigError, match=f"bcq.{name} is {value}, and bcq.generator={generator} "):
+        Settings(bcq=BCQSettings(generator=generator, **option)).check()

@@ -58,6 +58,10 @@ class CollectSettings:
         return experts_of(task, self.experts, noise=self.noise, gains=self.gains)
 
 
+OF_THE_AUTOENCODER = ("kl_weight", "kl_reduction", "latent_clip")
+"""Settings of stage 1 that no other generator reads."""
+
+
 @dataclass
 class BCQSettings:
     """Stage 1: one Batch-Constrained Q-learning agent per task.
@@ -204,6 +208,13 @@ class Settings:
                 f"bcq.n_steps is {bcq.n_steps} and bcq.action_chunk {bcq.action_chunk}; valid: one "
                 "of them 1, since a chunk's outcome is that of all its steps"
             )
+        for name in OF_THE_AUTOENCODER if bcq.generator != "autoencoder" else ():
+            value, default = getattr(bcq, name), getattr(BCQSettings(), name)
+            if value != default:
+                raise ConfigError(
+                    f"bcq.{name} is {value}, and bcq.generator={bcq.generator} does not read it; "
+                    f"valid with this generator: {default}, the default"
+                )
         if distill.task_encoder == "one_hot" and (
             evaluate.latent_sources != ["prototype"] or distill.isometry_weight
         ):

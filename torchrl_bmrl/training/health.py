@@ -99,5 +99,6 @@ def check_proposals(proposals: Tensor, demonstrated: Tensor, where: str) -> None
     if proposals.shape[-2] > 1 and spread < DEAD:
         raise BMRLError(
             f"{where}: all candidates of a state are equal (they differ by {spread:.1e}); the "
-            f"decoder ignores its latent; {_SAVED}; try a lower kl_weight or a larger latent_clip"
+            f"decoder ignores its latent; {_SAVED}; with the autoencoder try a lower kl_weight or "
+            "a larger latent_clip"
         )
