@@ -212,5 +212,9 @@ def test_presets_and_ablations_fill_valid_settings(recipes: Any, tmp_path: Path)
             settings = settings_of(
                 f"preset={preset}", f"ablation={ablation}", f"run_dir={tmp_path}"
             )
+            if ablation == "latent_clip_none" and settings.bcq.generator != "autoencoder":
+                with pytest.raises(ConfigError, match=r"bcq.latent_clip is None, and bcq.gen"):
+                    settings.check()
+                continue
             settings.check()
             assert len(Run(settings).names) == 6
