@@ -22,7 +22,7 @@ from file_runs import file_run, write_demonstrations
 from tensordict import TensorDict
 
 from torchrl_bmrl.errors import ConfigError
-from torchrl_bmrl.modules import ActionFlow, ActionMixture, BCQPolicy, ChunkPolicy
+from torchrl_bmrl.modules import ActionFlow, ActionMixture, ActionVAE, BCQPolicy, ChunkPolicy
 from torchrl_bmrl.objectives import BCQLoss
 from torchrl_bmrl.pipeline import (
     BCQSettings,
@@ -32,6 +32,7 @@ from torchrl_bmrl.pipeline import (
     stage1,
     stage2,
 )
+from torchrl_bmrl.pipeline.settings import OF_THE_AUTOENCODER
 from torchrl_bmrl.pipeline.stage1 import make_policy
 from torchrl_bmrl.pipeline.training_data import reward_statistics, training_data
 from torchrl_bmrl.pipeline.two_stage import two_stage
@@ -235,3 +236,10 @@ def test_settings_that_the_generator_does_not_read_are_refused_before_anything_i
     Settings(bcq=BCQSettings(**option)).check()
     with pytest.raises(ConfigError, match=f"bcq.{name} is {value}, and bcq.generator={generator} "):
         Settings(bcq=BCQSettings(generator=generator, **option)).check()
+
+
+@pytest.mark.parametrize("other", [ActionFlow, ActionMixture])
+def test_the_settings_of_the_autoencoder_are_the_options_that_no_other_generator_takes(
+    other: type[ActionFlow | ActionMixture],
+) -> None:
+    assert set(OF_THE_AUTOENCODER) == set(ActionVAE(1, 1).options) - set(other(1, 1).options)
