@@ -156,6 +156,12 @@ def as_context(transitions: TensorDictBase, mask: Tensor | None = None) -> Tenso
 
     Raises:
         BMRLError: for no transition, or a missing key.
+
+    Example:
+        >>> after = {"observation": torch.randn(9, 3), "reward": torch.randn(9, 1)}
+        >>> data = {"observation": torch.randn(9, 3), "action": torch.randn(9, 2), "next": after}
+        >>> as_context(TensorDict(data, [9]))["context"].shape
+        torch.Size([9])
     """
     shape = transitions.batch_size
     if not shape or not shape[-1]:
@@ -214,6 +220,10 @@ class ContextTaskLatent(PrototypeTaskLatent):
         encoder: :func:`make_context_encoder`'s module, trained.
         context: transitions that the context starts with in each episode, batch ``[K]``, or
             ``[*B, K]`` for the environments of a batch; ``None`` for none.
+
+    Raises:
+        BMRLError: for an encoder of single transitions, or a context that :func:`as_context`
+            refuses.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
