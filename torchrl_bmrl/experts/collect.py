@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import (
     count_episodes,
@@ -31,7 +33,7 @@ class _EpisodeJob:
     path: Path
     expert: ExpertSettings
     after: tuple[Task, ...]
-    like: Task | None
+    like: tuple[Task, ...]
 
 
 def _collect_job(job: _EpisodeJob, report: Report) -> None:
@@ -41,7 +43,7 @@ def _collect_job(job: _EpisodeJob, report: Report) -> None:
         noise=job.expert.noise,
         gains=job.expert.gains,
         after=job.after,
-        **({} if job.like is None else {"like": job.like}),
+        **({"like": job.like} if job.like else {}),
         **job.task.options,
     )
     keep_episode(job.path, episode)
@@ -72,7 +74,7 @@ def collect_demonstrations(
         tasks: tasks with ``record``, recorded in this order.
         episodes: number of training episodes by task name.
         valid_episodes: number of held-out episodes of each task, under ``mask/valid``.
-        context_episodes: number of episodes of each task in which the experts of the other tasks
+        context_episodes: number of episodes of each task in which the experts of some other tasks
             act in turn, under ``mask/context``; no agent is trained to act as in these.
         noise: standard deviation of the Gaussian action noise.
         seed: the seed; it decides every episode.
@@ -137,7 +139,7 @@ def collect_demonstrations(
             path=path,
             expert=chosen[name][i % len(chosen[name])],
             after=befores[name][i % len(befores[name])],
-            like=None if i < own[name] else _another(tasks, name, i - own[name]),
+            like=() if i < own[name] else others_than(tasks, name, seed=derive_seed(seed, name, i)),
         )
         for name, paths in parts.items()
         for i, path in enumerate(paths)
@@ -189,13 +191,26 @@ def collect_demonstrations(
     return files
 
 
-def _another(tasks: Sequence[Task], name: str, number: int) -> Task:
-    """Returns one of the other tasks; those of a task's numbers are spread over all others."""
-    names = [task.name for task in tasks]
-    others = len(tasks) - 1
-    # The golden ratio spreads few numbers evenly.
-    step = int(others * ((number + 1) * 0.6180339887498949 % 1))
-    return tasks[(names.index(name) + 1 + step) % len(tasks)]
+WANDERING = 4
+"""Experts that act in turn in an episode of another behaviour."""
+
+
+def others_than(tasks: Sequence[Task], name: str, *, seed: int) -> tuple[Task, ...]:
+    """Returns some of the other tasks at random, at most :data:`WANDERING`.
+
+    Args:
+        tasks: the tasks.
+        name: the task to leave out; it may be none of them.
+        seed: of the choice.
+
+    Example:
+        >>> tasks = [get_task(name) for name in ("reach", "lift", "push_up")]
+        >>> sorted(task.name for task in others_than(tasks, "lift", seed=0))
+        ['push_up', 'reach']
+    """
+    others = [task for task in tasks if task.name != name]
+    order = np.random.default_rng(seed).permutation(len(others))[:WANDERING]
+    return tuple(others[i] for i in order)
 
 
 def _parse_after(entry: str, by_name: Mapping[str, Task]) -> tuple[Task, ...]:

@@ -207,7 +207,7 @@ def record_episode(
     noise: float,
     gains: ExpertGains | None = None,
     after: Sequence[Task] = (),
-    like: Task | None = None,
+    like: Sequence[Task] = (),
     **options: Any,
 ) -> Episode:
     """Records one episode of the scripted expert; ``seed`` reproduces it.
@@ -221,8 +221,8 @@ def record_episode(
         gains: gains of the experts; ``None`` for the defaults.
         after: tasks whose experts act first; the episode starts in the state in which the last of
             them succeeded. If empty, it starts in the skill's own starting state.
-        like: a task with the same kind of skill, whose expert acts instead: a behaviour that does
-            not know what this task asks for; ``None`` for the task's own.
+        like: tasks with the same kind of skill, whose experts act instead, each for its share of
+            the episode: a behaviour that does not know what this task asks for.
         **options: ``robot``, ``gripper`` and ``stepper`` of
             :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`.
 
@@ -242,10 +242,11 @@ def record_episode(
     """
     from torchrl_bmrl.envs.robosuite_names import robosuite_metadata
 
-    if like is not None and [type(x) for x in like.options["skills"]] != [type(x) for x in skills]:
+    acted = [skill for task in like for skill in task.options["skills"]]
+    if acted and (len(skills) > 1 or {type(skill) for skill in acted} != {type(skills[0])}):
         raise BMRLError(
-            f"like is {like.name}; valid: a task with the same kind of skill as "
-            f"{'-'.join(skill.name for skill in skills)}"
+            f"like is {', '.join(task.name for task in like)}; valid: tasks with the same kind of "
+            f"skill as {'-'.join(skill.name for skill in skills)}, which must be one"
         )
     before, experts_before = _chain(after)
     env = _env((*before, *skills), options)
@@ -270,12 +271,12 @@ def record_episode(
         )
     # A composition's experts have different phases; its stages are stored instead.
     alone = len(skills) == 1
-    if like is not None and isinstance(expert, Expert):
-        (expert.skill,) = like.options["skills"]
     observations = {name: [part] for name, part in observation.items()}
     model_file = scene.scene_xml()
     actions, rewards, successes, phases, states, stages = [], [], [], [], [], []
-    for _ in range(horizon):
+    for step in range(horizon):
+        if acted and isinstance(expert, Expert):
+            expert.skill = acted[step * len(acted) // horizon]
         action = act()
         phases.append(expert.phase)
         states.append(scene.sim.get_state().flatten())
@@ -305,7 +306,7 @@ def record_episode(
             **({"phase_names": list(expert.phases)} if alone else {}),
             "model_file": model_file,
             **({"after": "-".join(skill.name for skill in before)} if before else {}),
-            **({} if like is None else {"like": like.name}),
+            **({"like": ", ".join(task.name for task in like)} if like else {}),
             "env_args": robosuite_metadata(
                 skills, options.get("robot", "Sawyer"), options.get("gripper", "default")
             ),

@@ -15,7 +15,7 @@ from torchrl_bmrl.objectives.common import LOSS_FUNCTIONS
 from torchrl_bmrl.objectives.distillation import CONTEXTS, ENCODER_TERMS
 from torchrl_bmrl.objectives.generative import KL_REDUCTIONS
 from torchrl_bmrl.pipeline.agents import GENERATORS
-from torchrl_bmrl.pipeline.student import LATENT_SOURCES, TASK_ENCODERS
+from torchrl_bmrl.pipeline.student import LATENT_SOURCES, OF_SETS, TASK_ENCODERS
 from torchrl_bmrl.run.folder import deciding
 from torchrl_bmrl.run.loggers import LOGGERS
 from torchrl_bmrl.run.settings import check_settings, setting
@@ -143,6 +143,38 @@ class DistillSettings:
     normalise_qvalue: bool = True  # with each teacher's mean and deviation
     prototype: str = setting("mean", choices=("mean", "medoid"))  # a task's point of m
 
+    def check(self, latent_sources: list[str]) -> None:
+        """Checks that the settings fit what the encoder of m reads.
+
+        Args:
+            latent_sources: the run's sources of m when it is evaluated.
+
+        Raises:
+            ConfigError: naming the setting, its value and the valid values.
+        """
+        needs: dict[str, Any] = {}
+        if self.task_encoder in OF_SETS:
+            needs = {"context_fraction": 1, "isometry_weight": 0}
+            if self.context not in ("set", "given"):
+                needs["context"] = "set or given"
+            elif self.batch_size < 2 * self.context_size:
+                needs["batch_size"] = f"at least {2 * self.context_size}, two contexts"
+        elif self.context == "given":
+            needs["task_encoder"] = " or ".join(OF_SETS)
+        if self.task_encoder in ("one_hot", "told", "nothing"):
+            needs["isometry_weight"] = 0
+            if latent_sources != ["prototype"]:
+                raise ConfigError(
+                    f"distill.task_encoder is {self.task_encoder}, which does not read "
+                    f"transitions, and evaluate.latent_sources {latent_sources}; valid: [prototype]"
+                )
+        for name, valid in needs.items():
+            if (value := getattr(self, name)) != valid:
+                raise ConfigError(
+                    f"distill.{name} is {value}; valid with distill.task_encoder="
+                    f"{self.task_encoder}: {valid}"
+                )
+
 
 @dataclass
 class EvaluateSettings:
@@ -222,12 +254,10 @@ class Settings:
                     f"bcq.{name} is {value}, and bcq.generator={bcq.generator} does not read it; "
                     f"valid with this generator: {default}, the default"
                 )
-        if distill.task_encoder == "one_hot" and (
-            evaluate.latent_sources != ["prototype"] or distill.isometry_weight
-        ):
+        distill.check(evaluate.latent_sources)
+        if distill.context == "given" and not self.collect.context_episodes:
             raise ConfigError(
-                "distill.task_encoder is one_hot, which does not read transitions; valid with it: "
-                "evaluate.latent_sources=[prototype] and distill.isometry_weight=0"
+                "distill.context is given and collect.context_episodes 0; valid: at least 1"
             )
         if self.only is not None and self.bcq.stacked:
             raise ConfigError(f"only is {self.only}; valid with bcq.stacked: null")

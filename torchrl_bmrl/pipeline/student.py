@@ -14,7 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.transforms import Transform
 
-from torchrl_bmrl.errors import CheckpointError, UnknownNameError
+from torchrl_bmrl.errors import BMRLError, CheckpointError, UnknownNameError
 from torchrl_bmrl.modules import (
     BCQPolicy,
     ContextTaskLatent,
@@ -46,8 +46,9 @@ class Student(nn.Module):
         action_dim: size of the action.
         task_encoder: ``"transition"``; ``"set_mean"`` or ``"set_attention"``: m of a set of
             transitions; ``"one_hot"``: m is the task's index, one-hot; ``"told"``: m is given by
-            ``codes``.
+            ``codes``; ``"nothing"``: m is one zero.
         task_latent_dim: size of m, except for the last two.
+        step_scale: of an encoder of sets, see :func:`~torchrl_bmrl.modules.make_context_encoder`.
         codes: numbers that the policy is told about each task, ``(num_tasks, n)``.
         num_cells: widths of the hidden layers.
         latent_dim: size of the teachers' ``action_latent``; by default twice the action's.
@@ -78,6 +79,7 @@ class Student(nn.Module):
         task_latent_dim: int = 2,
         num_cells: Sequence[int] = (256, 256),
         latent_dim: int | None = None,
+        step_scale: Sequence[float] | None = None,
         codes: Sequence[Sequence[float]] | None = None,
     ) -> None:
         super().__init__()
@@ -88,7 +90,8 @@ class Student(nn.Module):
         if task_encoder == "one_hot":
             task_latent_dim = num_tasks
             self.task_encoder = make_one_hot_encoder(num_tasks)
-        elif task_encoder == "told":
+        elif task_encoder in ("told", "nothing"):
+            codes = codes if task_encoder == "told" else [[0.0]] * num_tasks
             table = torch.tensor(codes, dtype=torch.get_default_dtype())
             task_latent_dim = table.shape[-1]
             self.task_encoder = make_told_encoder(table)
@@ -98,6 +101,7 @@ class Student(nn.Module):
                 task_latent_dim,
                 pooling=task_encoder.removeprefix("set_"),
                 num_cells=num_cells,
+                step_scale=step_scale,
             )
         else:
             self.task_encoder = make_task_encoder(*dims, task_latent_dim, num_cells=num_cells)
@@ -116,7 +120,12 @@ class Student(nn.Module):
 
         Args:
             data: batch ``[*B]`` with the encoder's inputs: a transition, or ``task``.
+
+        Raises:
+            BMRLError: for an encoder of sets, which has no embedding of one transition.
         """
+        if reads_context(self.task_encoder):
+            raise BMRLError("the encoder reads sets of transitions; valid: embed_context")
         return self.task_encoder(data.select(*self.task_encoder.in_keys)).get("task_latent")
 
     def embed_context(self, context: TensorDictBase) -> Tensor:
@@ -256,7 +265,7 @@ def make_distillation_loss(
 
 LATENT_SOURCES = ("prototype", "online", "demonstration")
 OF_SETS = ("set_mean", "set_attention")
-TASK_ENCODERS = ("transition", *OF_SETS, "one_hot", "told")
+TASK_ENCODERS = ("transition", *OF_SETS, "one_hot", "told", "nothing")
 
 
 def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
