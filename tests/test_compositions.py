@@ -11,8 +11,9 @@ pytest.importorskip("robosuite", exc_type=ImportError)
 
 import torch
 
-from torchrl_bmrl.envs.scene import CUBE_HALF_SIZE, HOVER_HEIGHT, TABLE_TOP, TabletopScene
+from torchrl_bmrl.envs.scene import TabletopScene
 from torchrl_bmrl.envs.skills import Reach
+from torchrl_bmrl.envs.table import CUBE_HALF_SIZE, HOVER_HEIGHT, TABLE_TOP
 from torchrl_bmrl.envs.tabletop import TabletopEnv
 from torchrl_bmrl.envs.transforms import make_env
 from torchrl_bmrl.envs.vector import TabletopVectorEnv

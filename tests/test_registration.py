@@ -12,11 +12,12 @@ import pytest
 
 pytest.importorskip("gymnasium")
 
+from torchrl_bmrl.envs.hidden import HIDDEN
 from torchrl_bmrl.envs.registration import gymnasium_id
 from torchrl_bmrl.envs.skills import SKILLS
 
 GROUP = "gymnasium.envs"
-IDS = [gymnasium_id(task) for task in (*SKILLS, "reach-lift")]
+IDS = [gymnasium_id(task) for task in (*SKILLS, "reach-lift", *HIDDEN)]
 
 
 def declared() -> EntryPoint:

@@ -250,7 +250,8 @@ def test_sections_without_data_are_left_out() -> None:
 
 @pytest.mark.robosuite
 def test_what_the_page_says_of_rewards_and_experts_is_so() -> None:
-    from torchrl_bmrl.envs import scene, skills
+    from torchrl_bmrl.envs import skills
+    from torchrl_bmrl.envs import table as scene
     from torchrl_bmrl.experts import controllers
 
     text = " ".join(make_results_page(Published()).text.split())

@@ -9,7 +9,7 @@ pytest.importorskip("robosuite", exc_type=ImportError)
 
 from scene_state import TASKS, cube, eef, simulator
 
-from torchrl_bmrl.envs.scene import (
+from torchrl_bmrl.envs.table import (
     CUBE_HALF_SIZE,
     CUBE_RANGE,
     HOME,

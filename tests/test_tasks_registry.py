@@ -20,6 +20,7 @@ from torchrl_bmrl.tasks import (
     compose_tasks,
     get_task,
     register_task,
+    registered_families,
     registered_tasks,
 )
 
@@ -91,7 +92,7 @@ def test_a_module_that_does_not_register_the_name_is_refused(module: str) -> Non
 def test_an_unknown_name_is_refused_with_all_that_are_known(name: str) -> None:
     with pytest.raises(UnknownNameError) as caught:
         get_task(name)
-    assert caught.value.valid == registered_tasks()
+    assert caught.value.valid == (*registered_tasks(), *registered_families())
     assert all(known in str(caught.value) for known in SIX)
 
 

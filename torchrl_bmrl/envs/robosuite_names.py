@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from torchrl_bmrl.envs.scene import CONTROL_FREQUENCY, TabletopScene
+from torchrl_bmrl.envs.scene import TabletopScene
 from torchrl_bmrl.envs.skills import Push, SkillLike, describe_skill, make_skills
+from torchrl_bmrl.envs.table import CONTROL_FREQUENCY
 from torchrl_bmrl.extras import needs
 
 with needs("robosuite"):

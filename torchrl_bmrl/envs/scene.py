@@ -19,6 +19,16 @@ from torchrl_bmrl.envs.caching import user_numba_cache
 from torchrl_bmrl.envs.lean import without_pictures
 from torchrl_bmrl.envs.physics import check_mujoco, kept_environment
 from torchrl_bmrl.envs.skills import Skill, SkillLike, make_skills
+from torchrl_bmrl.envs.table import (
+    CONTROL_FREQUENCY,
+    CUBE_HALF_SIZE,
+    CUBE_RANGE,
+    HOVER_HEIGHT,
+    TABLE_SIZE,
+    TABLE_TOP,
+    TARGET_HIGH,
+    TARGET_LOW,
+)
 from torchrl_bmrl.extras import needs
 
 # robosuite logs "no private macro file" and controller notes at import and at every construction.
@@ -37,22 +47,6 @@ with needs("robosuite"), user_numba_cache(), kept_environment("MUJOCO_GL"):
     from robosuite.models.tasks import ManipulationTask
     from robosuite.utils.mjcf_utils import new_site
     from robosuite.utils.observables import Observable, sensor
-
-CONTROL_FREQUENCY = 20
-"""Actions per second [Hz]."""
-TABLE_SIZE = (0.8, 0.8, 0.05)
-TABLE_TOP = np.array([0.0, 0.0, 0.8])
-"""Centre of the table's surface [m]; +x points away from the robot, +y to its left."""
-CUBE_HALF_SIZE = 0.021
-CUBE_RANGE = 0.08
-"""The cube starts within this distance of the table's centre along x and along y [m]."""
-HOVER_HEIGHT = 0.10
-"""Height of the gripper above the cube's centre when a skill on the cube starts [m]."""
-HOME = TABLE_TOP + np.array([0.0, 0.0, 0.20])
-HOME_RADIUS = 0.01
-"""Without a cube the end-effector starts within this distance of ``HOME`` [m]."""
-TARGET_LOW = TABLE_TOP + np.array([-0.12, -0.20, 0.06])
-TARGET_HIGH = TABLE_TOP + np.array([0.12, 0.20, 0.32])
 
 
 class _LeanTask(ManipulationTask):
@@ -106,6 +100,7 @@ class TabletopScene(ManipulationEnv):
         self.skills = make_skills(skills)
         self.stage = 0
         self.targets = np.zeros((len(self.skills), 3))
+        self.start_position, self._start_step = np.zeros(3), 0
         self.has_cube = len(self.skills) > 1 or self.skills[0].has_cube
         self.lean = lean
         settings: dict[str, Any] = {
@@ -227,17 +222,12 @@ class TabletopScene(ManipulationEnv):
             self.targets = self.rng.uniform(TARGET_LOW, TARGET_HIGH, self.targets.shape)
         start = self.skill.start(self)
         self._begin_stage()
+        self.start_position, self._start_step = start, 0
         return start
 
     def _begin_stage(self) -> None:
         following = self.skills[self.stage + 1 : self.stage + 2]
         self.goal_start = self.skill.begin(self, following[0] if following else None)
-
-    def sample_home(self) -> np.ndarray:
-        """A random point within ``HOME_RADIUS`` of ``HOME``, (3,) [m]."""
-        direction = self.rng.standard_normal(3)
-        radius = HOME_RADIUS * self.rng.uniform() ** (1 / 3)
-        return HOME + radius * direction / np.linalg.norm(direction)
 
     # -- skills --------------------------------------------------------------------------------
 
@@ -250,6 +240,11 @@ class TabletopScene(ManipulationEnv):
     def target(self) -> np.ndarray:
         """The random point of the workspace that belongs to the skill at hand, (3,) [m]."""
         return self.targets[min(self.stage, len(self.skills) - 1)].copy()
+
+    @property
+    def stage_time(self) -> float:
+        """Time since the skill at hand began, at ``start_position`` of the end-effector [s]."""
+        return (self.timestep - self._start_step) * self.control_timestep
 
     @property
     def carrying(self) -> bool:
@@ -269,6 +264,7 @@ class TabletopScene(ManipulationEnv):
             self.stage += 1
             if self.stage < len(self.skills):
                 self._begin_stage()
+                self.start_position, self._start_step = self.eef_position, self.timestep
 
     def _check_success(self) -> bool:
         if len(self.skills) > 1:
@@ -296,11 +292,12 @@ class TabletopScene(ManipulationEnv):
     # -- state ---------------------------------------------------------------------------------
 
     def episode_state(self) -> dict[str, np.ndarray]:
-        """The episode's state besides the simulator's.
-
-        ``goal_start`` (3,); in compositions also ``stage`` (1,) and ``targets`` (stages, 3).
+        """State besides the simulator's: ``goal_start``; ``stage`` and ``targets`` of compositions;
+        for timed skills ``start`` (4,), position and step of the stage's start.
         """
         state = {"goal_start": self.goal_start}
+        if any(skill.timed for skill in self.skills):
+            state["start"] = np.append(self.start_position, self._start_step)
         if len(self.skills) > 1:
             state |= {"stage": np.array([self.stage]), "targets": self.targets.copy()}
         return state
@@ -312,6 +309,11 @@ class TabletopScene(ManipulationEnv):
             state: of :meth:`episode_state`.
         """
         self.goal_start = state["goal_start"]
+        if any(skill.timed for skill in self.skills):
+            self.start_position, self._start_step = (
+                state["start"][:3].copy(),
+                int(state["start"][3]),
+            )
         if len(self.skills) > 1:
             self.stage = int(state["stage"][0])
             self.targets = state["targets"].copy()

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from torchrl_bmrl.envs.table import sample_home
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 
 if TYPE_CHECKING:
@@ -74,6 +75,8 @@ class Skill:
         has_cube: whether the scene needs the cube.
         has_target: whether the scene draws a random point for it, ``scene.target``.
         holds_cube_after: whether the cube is in the hand after success; ``None``: as before.
+        timed: whether it reads ``scene.stage_time`` and ``scene.start_position``, which belong to
+            the state of an episode then.
 
     Example:
         >>> from torchrl_bmrl.envs.tabletop import TabletopEnv
@@ -97,6 +100,7 @@ class Skill:
     has_cube: ClassVar[bool] = True
     has_target: ClassVar[bool] = False
     holds_cube_after: ClassVar[bool | None] = None
+    timed: ClassVar[bool] = False
 
     # A plain attribute in most subclasses, a property where fields decide it.
     name: ClassVar[Any]
@@ -169,7 +173,7 @@ class Reach(Skill):
 
     def start(self, scene: TabletopScene) -> np.ndarray:
         """A random point within 1 cm of the set point."""
-        return scene.sample_home()
+        return sample_home(scene.rng)
 
     def begin(self, scene: TabletopScene, following: Skill | None) -> np.ndarray:
         """The point to reach."""

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from torchrl_bmrl.envs.rendering import graphics_library, make_renderer
-from torchrl_bmrl.envs.scene import CONTROL_FREQUENCY, TabletopScene
+from torchrl_bmrl.envs.scene import TabletopScene
 from torchrl_bmrl.envs.skills import REWARD_TERMS, SkillLike
 from torchrl_bmrl.envs.stepper import FastStepper
+from torchrl_bmrl.envs.table import CONTROL_FREQUENCY
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.extras import needs
 

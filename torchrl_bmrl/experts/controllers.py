@@ -116,7 +116,11 @@ class Expert:
         current = self.env.eef_rotation
         error = 0.5 * np.cross(current, self._rotation, axis=0).sum(axis=1)
         turn = self.gains.rotation * error / ROTATION_SCALE
-        return np.concatenate([np.clip(delta, -limit, limit), np.clip(turn, -1, 1), [gripper]])
+        return np.concatenate([self._limited(delta, limit), np.clip(turn, -1, 1), [gripper]])
+
+    def _limited(self, delta: np.ndarray, limit: float) -> np.ndarray:
+        """Position action (3,) within the speed limit."""
+        return np.clip(delta, -limit, limit)
 
 
 class ReachExpert(Expert):
@@ -130,7 +134,10 @@ class ReachExpert(Expert):
         self._gripper = CLOSE if self.env.gripper.closing else OPEN
 
     def _target(self) -> tuple[np.ndarray, float, float]:
-        return self.env.goal, self._gripper, self.gains.speed_limit
+        return self._goal(), self._gripper, self.gains.speed_limit
+
+    def _goal(self) -> np.ndarray:
+        return self.env.goal
 
 
 class LiftExpert(Expert):
@@ -145,6 +152,9 @@ class LiftExpert(Expert):
 
     def _gain(self) -> float:
         return self.gains.grasp_position
+
+    def _height(self) -> float:
+        return self.gains.lift_height
 
     def _target(self) -> tuple[np.ndarray, float, float]:
         cube, limit = self.env.goal, self.gains.contact_speed_limit
@@ -162,12 +172,20 @@ class LiftExpert(Expert):
             if self._closing > self.gains.grasp_steps and arrived:
                 self.phase = 2
             return cube, CLOSE, limit
-        top = cube.copy()
-        top[2] = self.env.goal_start[2] + self.gains.lift_height
-        if not self.env.grasped and cube[2] < self.env.goal_start[2] + 0.01:
-            self.phase, self._closing = 0, 0  # dropped or missed
+        if self._lost(cube):
+            self.phase, self._closing = 0, 0
             return cube + np.array([0.0, 0.0, 0.05]), OPEN, limit
-        return top, CLOSE, self.gains.speed_limit
+        return self._carry(cube), CLOSE, self.gains.speed_limit
+
+    def _lost(self, cube: np.ndarray) -> bool:
+        """Whether the cube was dropped or missed."""
+        return not self.env.grasped and bool(cube[2] < self.env.goal_start[2] + 0.01)
+
+    def _carry(self, cube: np.ndarray) -> np.ndarray:
+        """Target position (3,) [m] of the grasped cube."""
+        top = cube.copy()
+        top[2] = self.env.goal_start[2] + self._height()
+        return top
 
 
 class PushExpert(Expert):

@@ -11,7 +11,7 @@ from torchrl_bmrl.data.options import ReadOptions
 from torchrl_bmrl.envs.gym import make_gym_env
 from torchrl_bmrl.errors import BMRLError, ConfigError
 from torchrl_bmrl.run.folder import read_yaml
-from torchrl_bmrl.tasks import DemonstrationFiles, Task, get_task
+from torchrl_bmrl.tasks import DemonstrationFiles, Task, get_task, tasks_of
 
 
 def _is_text(x: Any) -> bool:
@@ -75,8 +75,8 @@ def make_tasks(tasks: Sequence[str] | Mapping[str, Mapping[str, Any]]) -> tuple[
     """Returns the tasks that the settings describe.
 
     Args:
-        tasks: names (:func:`~torchrl_bmrl.tasks.get_task`), or descriptions by name as in a
-            :func:`read_task_file`.
+        tasks: names of tasks and families (:func:`~torchrl_bmrl.tasks.tasks_of`), or descriptions
+            by name as in a :func:`read_task_file`.
 
     Returns:
         the tasks in their order; a task's class index is its position.
@@ -95,7 +95,7 @@ def make_tasks(tasks: Sequence[str] | Mapping[str, Mapping[str, Any]]) -> tuple[
     if isinstance(tasks, Mapping):
         made = [_make_task(name, entry) for name, entry in tasks.items()]
     elif isinstance(tasks, Sequence) and all(map(_is_text, tasks)) and not isinstance(tasks, str):
-        made = [get_task(name) for name in tasks]
+        made = [task for name in tasks for task in tasks_of(name)]
     else:
         raise ConfigError(f"tasks is {tasks!r}; valid: a list of names, or a YAML file of tasks")
     names = [task.name for task in made]

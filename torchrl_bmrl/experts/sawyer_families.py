@@ -1,0 +1,195 @@
+"""Families of Sawyer tasks whose parameter the observation does not show, and their experts.
+
+Importing this module registers ``push_towards``, ``reach_hidden``, ``lift_to_height`` and
+``reach_at_speed``; it does not import the simulator.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from torchrl_bmrl.envs.hidden import (
+    HIDDEN,
+    LiftToHeight,
+    PushTowards,
+    ReachAtSpeed,
+)
+from torchrl_bmrl.experts.controllers import (
+    EXPERTS,
+    Expert,
+    LiftExpert,
+    ReachExpert,
+)
+from torchrl_bmrl.experts.tabletop import make_task
+from torchrl_bmrl.tasks import Family, Task, register_family
+
+LEAD = 0.12
+"""The expert aims at where the end-effector should be in this time, since the arm lags [s]."""
+STEER = 3.0
+"""How many times its distance from the line the cube is sent back towards it."""
+HOVER = 0.01
+"""Height above the table at which the cube is moved [m]."""
+
+
+def straight(delta: np.ndarray, limit: float) -> np.ndarray:
+    """Limits the length of a position action, not each of its numbers: its direction stays.
+
+    Args:
+        delta: position action (3,).
+        limit: largest length.
+
+    Example:
+        >>> straight(np.array([0.0, 4.0, 0.0]), 0.5).tolist()
+        [0.0, 0.5, 0.0]
+    """
+    return delta * min(1.0, limit / max(float(np.linalg.norm(delta)), 1e-9))
+
+
+class PushTowardsExpert(LiftExpert):
+    """Takes the cube between the fingers and moves it over a line across the skill's direction.
+
+    Closed fingers that push from outside slip off in the diagonals. The cube hovers closely above
+    the table, whose friction would turn the arm aside.
+    """
+
+    phases = ("descend", "grasp", "push")
+
+    def _gain(self) -> float:
+        return self.gains.position if self.phase == 2 else self.gains.grasp_position
+
+    def _lost(self, cube: np.ndarray) -> bool:
+        return bool(np.linalg.norm(self.env.eef_position - cube) > 0.03)
+
+    def _carry(self, cube: np.ndarray) -> np.ndarray:
+        """Ahead of the cube until it is over the line."""
+        assert isinstance(self.skill, PushTowards)
+        unit = self.skill.unit
+        ahead = min(0.10, max(0.0, self.gains.push_line - float(cube @ unit)))
+        # Along the line through the cube's start, since the arm drifts sideways.
+        start = self.env.goal_start
+        aside = cube - start - ((cube - start) @ unit) * unit
+        target = cube + ahead * unit - STEER * aside
+        target[2] = self.env.goal_start[2] + HOVER
+        return target
+
+    def _limited(self, delta: np.ndarray, limit: float) -> np.ndarray:
+        return straight(delta, limit)
+
+
+class ReachHiddenExpert(ReachExpert):
+    """Moves straight to the point, which it knows."""
+
+    def _goal(self) -> np.ndarray:
+        return self.env.goal_start
+
+
+class LiftToHeightExpert(LiftExpert):
+    """Lifts the cube to the skill's height."""
+
+    def _height(self) -> float:
+        assert isinstance(self.skill, LiftToHeight)
+        return self.skill.height / 100
+
+
+class ReachAtSpeedExpert(ReachExpert):
+    """Follows the point that moves to the goal at the skill's speed."""
+
+    def _goal(self) -> np.ndarray:
+        assert isinstance(self.skill, ReachAtSpeed)
+        return self.skill.pacemaker(self.env, ahead=LEAD)
+
+    def _limited(self, delta: np.ndarray, limit: float) -> np.ndarray:
+        return straight(delta, limit)
+
+
+HIDDEN_EXPERTS: dict[str, type[Expert]] = {
+    "push_towards": PushTowardsExpert,
+    "reach_hidden": ReachHiddenExpert,
+    "lift_to_height": LiftToHeightExpert,
+    "reach_at_speed": ReachAtSpeedExpert,
+}
+"""Experts by the name of the family."""
+EXPERTS.update({HIDDEN[name]: expert for name, expert in HIDDEN_EXPERTS.items()})
+
+
+def make_member(family: str, *parameter: float) -> Task:
+    """Returns a member of one of this module's families, with any parameter.
+
+    Args:
+        family: a key of :data:`HIDDEN_EXPERTS`.
+        *parameter: fields of the family's skill (:mod:`torchrl_bmrl.envs.hidden`).
+
+    Example:
+        >>> make_member("push_towards", 45).name
+        'push_towards_45'
+    """
+    return make_task(HIDDEN[family](*parameter), HIDDEN_EXPERTS[family])
+
+
+def _points(number: int, low: tuple[int, ...], high: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """Whole points that fill a box evenly: multiples of the generalised golden ratio."""
+    ratio = 1.22074408460575947536  # the real root of x^4 = x + 1
+    steps = ratio ** -np.arange(1, len(low) + 1)
+    share = (0.5 + np.arange(1, number + 1)[:, None] * steps) % 1
+    points = np.round(np.array(low) + share * (np.array(high) - low)).astype(int)
+    return [tuple(point) for point in points.tolist()]
+
+
+def _circle(direction: float) -> tuple[float, float]:
+    angle = np.deg2rad(direction)
+    return float(np.cos(angle)), float(np.sin(angle))
+
+
+_POINTS = _points(32, (-12, -20, 6), (12, 20, 32))
+
+register_family(
+    Family(
+        name="push_towards",
+        parameters=("direction [°]",),
+        members={
+            "train": [(angle,) for angle in range(0, 271, 30)],
+            "inside": [(angle,) for angle in range(15, 270, 30)],
+            "outside": [(angle,) for angle in range(285, 360, 15)],
+        },
+        make=partial(make_member, "push_towards"),
+        code=_circle,
+    )
+)
+register_family(
+    Family(
+        name="reach_hidden",
+        parameters=("x [cm]", "y [cm]", "z [cm]"),
+        members={
+            "train": _POINTS,
+            "inside": _points(8, (-9, -15, 10), (9, 15, 28)),
+            "outside": [(0, 26, 20), (0, -26, 20), (0, 0, 38), (16, 20, 20), (-14, -24, 30)],
+        },
+        make=partial(make_member, "reach_hidden"),
+    )
+)
+register_family(
+    Family(
+        name="lift_to_height",
+        parameters=("height [cm]",),
+        members={
+            "train": [(height,) for height in range(6, 21, 2)],
+            "inside": [(height,) for height in range(7, 20, 2)],
+            "outside": [(4,), (22,), (24,), (26,)],
+        },
+        make=partial(make_member, "lift_to_height"),
+    )
+)
+register_family(
+    Family(
+        name="reach_at_speed",
+        parameters=("speed [mm/s]",),
+        members={
+            "train": [(speed,) for speed in range(30, 121, 10)],
+            "inside": [(speed,) for speed in range(35, 120, 10)],
+            "outside": [(20,), (25,), (130,), (140,), (150,)],
+        },
+        make=partial(make_member, "reach_at_speed"),
+    )
+)
