@@ -274,11 +274,11 @@ def test_the_pipeline_takes_members_by_name(tmp_path: Any) -> None:
     pytest.importorskip("safetensors")
     pytest.importorskip("tqdm")
     pytest.importorskip("yaml")
-    from torchrl_bmrl.pipeline import BCQSettings, EvaluateSettings, Run, Settings, stage1
+    from torchrl_bmrl.pipeline import BCQSettings, EvaluateSettings, Run, Settings, collect, stage1
 
     names = [f"{MODULE}:ml1_push_{number:02d}" for number in range(2)]
     settings = Settings(
-        run_dir=tmp_path,
+        run_dir=str(tmp_path),
         tasks={name.rpartition(":")[2]: {"task": name, "horizon": 20} for name in names},
         workers=1,
         bcq=BCQSettings(epochs=1, updates_per_epoch=5, eval_episodes=2),
@@ -287,6 +287,7 @@ def test_the_pipeline_takes_members_by_name(tmp_path: Any) -> None:
     settings.collect.train_episodes = {"default": 1}
     settings.collect.valid_episodes = 1
     with Run(settings) as run:
+        collect(run)
         stage1(run)
         assert run.transitions("ml1_push_01", "valid")["observation"].shape == (20, 39)
 

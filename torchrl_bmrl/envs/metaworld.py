@@ -77,14 +77,23 @@ class MetaWorldEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: Any = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode; all episodes of a task start in the same state, whatever the seed."""
+        """Starts an episode; all episodes of a task start in the same state, whatever the seed.
+
+        Args:
+            seed: accepted and without effect.
+            options: accepted and without effect.
+        """
         super().reset(seed=seed)
         self._observation, _ = self.metaworld_env.reset()
         self._steps = 0
         return self._observation.astype(np.float32), {"success": np.array(False)}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Advances by 12.5 ms; episodes are truncated, never terminated."""
+        """Advances by 12.5 ms; episodes are truncated, never terminated.
+
+        Args:
+            action: (4,) in [-1, 1].
+        """
         self._observation, reward, _, _, info = self.metaworld_env.step(action)
         self._steps += 1
         success = {"success": np.array(bool(info["success"]))}

@@ -43,6 +43,10 @@ class RandomSpace:
         shown: positions of the numbers that are a member's parameter.
         apart: smallest horizontal distance of object and goal [m]; Meta-World draws again below
             it.
+
+    Example:
+        >>> RandomSpace((0.0, 0.0), (1.0, 0.0), shown=(0,)).draw(np.random.default_rng(0))
+        (0.636962, 0.0)
     """
 
     low: Vector
@@ -51,7 +55,11 @@ class RandomSpace:
     apart: float = 0.0
 
     def draw(self, rng: np.random.Generator) -> Vector:
-        """Draws a ``rand_vec``."""
+        """Draws a ``rand_vec``.
+
+        Args:
+            rng: source of the random numbers.
+        """
         while True:
             vector = _uniform(rng, self.low, self.high)
             if not self.apart or math.dist(vector[:2], vector[3:5]) >= self.apart:
@@ -188,6 +196,10 @@ def make_ml1_env(*, num_envs: int | None = None, **options: Any) -> EnvBase:
     Args:
         num_envs: number of environments side by side; ``None`` for one without a batch dimension.
         **options: ``env``, ``rand_vec`` and ``horizon``.
+
+    Example:
+        >>> make_ml1_env(env="drawer-close-v3", rand_vec=(0.05, 0.9, 0.0)).action_spec.shape
+        torch.Size([4])
     """
     with needs("metaworld"):
         from torchrl_bmrl.envs import metaworld
