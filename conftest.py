@@ -87,7 +87,11 @@ _NEEDS = {
         "torchrl_bmrl/evaluation/rollout.py",
         "torchrl_bmrl/experts/*",
     ],
-    "safetensors": ["torchrl_bmrl/pipeline/agents.py", "torchrl_bmrl/training/checkpoint.py"],
+    "safetensors": [
+        "torchrl_bmrl/pipeline/agents.py",
+        "torchrl_bmrl/pipeline/student.py",
+        "torchrl_bmrl/training/checkpoint.py",
+    ],
     "scipy": [
         "tests/explorers.py",
         "tests/report_data.py",

@@ -31,6 +31,7 @@ class _EpisodeJob:
     path: Path
     expert: ExpertSettings
     after: tuple[Task, ...]
+    like: Task | None
 
 
 def _collect_job(job: _EpisodeJob, report: Report) -> None:
@@ -40,6 +41,7 @@ def _collect_job(job: _EpisodeJob, report: Report) -> None:
         noise=job.expert.noise,
         gains=job.expert.gains,
         after=job.after,
+        **({} if job.like is None else {"like": job.like}),
         **job.task.options,
     )
     keep_episode(job.path, episode)
@@ -52,6 +54,7 @@ def collect_demonstrations(
     episodes: Mapping[str, int],
     *,
     valid_episodes: int,
+    context_episodes: int = 0,
     noise: float,
     seed: int,
     workers: int,
@@ -69,6 +72,8 @@ def collect_demonstrations(
         tasks: tasks with ``record``, recorded in this order.
         episodes: number of training episodes by task name.
         valid_episodes: number of held-out episodes of each task, under ``mask/valid``.
+        context_episodes: number of episodes of each task in which the experts of the other tasks
+            act in turn, under ``mask/context``; no agent is trained to act as in these.
         noise: standard deviation of the Gaussian action noise.
         seed: the seed; it decides every episode.
         workers: number of processes.
@@ -116,7 +121,10 @@ def collect_demonstrations(
     changes = experts or {}
     chosen = {name: experts_of(name, changes, noise=noise, gains=gains) for name in by_name}
     files = {name: directory / f"{name}.hdf5" for name in by_name}
-    counts = {name: episodes[name] + valid_episodes for name in by_name}
+    if context_episodes and len(tasks) < 2:
+        raise ConfigError("context_episodes with one task; valid: at least two tasks, or 0")
+    own = {name: episodes[name] + valid_episodes for name in by_name}
+    counts = {name: number + context_episodes for name, number in own.items()}
     parts = {
         name: [directory / ".episodes" / name / f"{i:05d}.npz" for i in range(counts[name])]
         for name, path in files.items()
@@ -129,6 +137,7 @@ def collect_demonstrations(
             path=path,
             expert=chosen[name][i % len(chosen[name])],
             after=befores[name][i % len(befores[name])],
+            like=None if i < own[name] else _another(tasks, name, i - own[name]),
         )
         for name, paths in parts.items()
         for i, path in enumerate(paths)
@@ -149,7 +158,8 @@ def collect_demonstrations(
         first, count = read_kept_episode(paths[0]), len(chosen[name])
         masks = {
             "train": range(episodes[name]),
-            "valid": range(episodes[name], counts[name]),
+            "valid": range(episodes[name], own[name]),
+            **({"context": range(own[name], counts[name])} if context_episodes else {}),
         }
         write_episodes(
             files[name],
@@ -177,6 +187,15 @@ def collect_demonstrations(
                 "run_dir or remove the file",
             )
     return files
+
+
+def _another(tasks: Sequence[Task], name: str, number: int) -> Task:
+    """Returns one of the other tasks; those of a task's numbers are spread over all others."""
+    names = [task.name for task in tasks]
+    others = len(tasks) - 1
+    # The golden ratio spreads few numbers evenly.
+    step = int(others * ((number + 1) * 0.6180339887498949 % 1))
+    return tasks[(names.index(name) + 1 + step) % len(tasks)]
 
 
 def _parse_after(entry: str, by_name: Mapping[str, Task]) -> tuple[Task, ...]:

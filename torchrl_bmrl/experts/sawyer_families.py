@@ -12,6 +12,7 @@ import numpy as np
 
 from torchrl_bmrl.envs.hidden import (
     HIDDEN,
+    HIDDEN_HORIZONS,
     LiftToHeight,
     PushTowards,
     ReachAtSpeed,
@@ -82,7 +83,7 @@ class ReachHiddenExpert(ReachExpert):
     """Moves straight to the point, which it knows."""
 
     def _goal(self) -> np.ndarray:
-        return self.env.goal_start
+        return self.skill.begin(self.env, None)
 
 
 class LiftToHeightExpert(LiftExpert):
@@ -125,7 +126,8 @@ def make_member(family: str, *parameter: float) -> Task:
         >>> make_member("push_towards", 45).name
         'push_towards_45'
     """
-    return make_task(HIDDEN[family](*parameter), HIDDEN_EXPERTS[family])
+    skill = HIDDEN[family](*parameter)
+    return make_task(skill, HIDDEN_EXPERTS[family], horizon=HIDDEN_HORIZONS[family])
 
 
 def _points(number: int, low: tuple[int, ...], high: tuple[int, ...]) -> list[tuple[int, ...]]:

@@ -207,6 +207,7 @@ def record_episode(
     noise: float,
     gains: ExpertGains | None = None,
     after: Sequence[Task] = (),
+    like: Task | None = None,
     **options: Any,
 ) -> Episode:
     """Records one episode of the scripted expert; ``seed`` reproduces it.
@@ -220,6 +221,8 @@ def record_episode(
         gains: gains of the experts; ``None`` for the defaults.
         after: tasks whose experts act first; the episode starts in the state in which the last of
             them succeeded. If empty, it starts in the skill's own starting state.
+        like: a task with the same kind of skill, whose expert acts instead: a behaviour that does
+            not know what this task asks for; ``None`` for the task's own.
         **options: ``robot``, ``gripper`` and ``stepper`` of
             :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`.
 
@@ -228,7 +231,7 @@ def record_episode(
         a composition ``stages``. The attribute ``env_args`` is robomimic's.
 
     Raises:
-        BMRLError: if the experts of ``after`` fail from 100 starts.
+        BMRLError: if the experts of ``after`` fail from 100 starts, or ``like`` has other skills.
 
     Example:
         >>> from torchrl_bmrl.tasks import get_task
@@ -239,6 +242,11 @@ def record_episode(
     """
     from torchrl_bmrl.envs.robosuite_names import robosuite_metadata
 
+    if like is not None and [type(x) for x in like.options["skills"]] != [type(x) for x in skills]:
+        raise BMRLError(
+            f"like is {like.name}; valid: a task with the same kind of skill as "
+            f"{'-'.join(skill.name for skill in skills)}"
+        )
     before, experts_before = _chain(after)
     env = _env((*before, *skills), options)
     scene = env.robosuite_env
@@ -260,6 +268,10 @@ def record_episode(
             f"the experts of {'-'.join(skill.name for skill in before)} failed from {MAX_ATTEMPTS} "
             "starts; valid in after: tasks that their experts solve"
         )
+    # A composition's experts have different phases; its stages are stored instead.
+    alone = len(skills) == 1
+    if like is not None and isinstance(expert, Expert):
+        (expert.skill,) = like.options["skills"]
     observations = {name: [part] for name, part in observation.items()}
     model_file = scene.scene_xml()
     actions, rewards, successes, phases, states, stages = [], [], [], [], [], []
@@ -275,8 +287,6 @@ def record_episode(
         rewards.append(reward)
         successes.append(scene.skill_success() if before else info["success"])
     parts = {name: np.stack(rows) for name, rows in observations.items()}
-    # A composition's experts have different phases; its stages are stored instead.
-    alone = len(skills) == 1
     return Episode(
         observations={name: part[:-1] for name, part in parts.items()},
         next_observations={name: part[1:] for name, part in parts.items()},
@@ -295,6 +305,7 @@ def record_episode(
             **({"phase_names": list(expert.phases)} if alone else {}),
             "model_file": model_file,
             **({"after": "-".join(skill.name for skill in before)} if before else {}),
+            **({} if like is None else {"like": like.name}),
             "env_args": robosuite_metadata(
                 skills, options.get("robot", "Sawyer"), options.get("gripper", "default")
             ),

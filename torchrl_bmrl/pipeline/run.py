@@ -26,8 +26,9 @@ from torchrl_bmrl.envs.transforms import ObservationStatistics, make_env
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome, evaluate_policy
 from torchrl_bmrl.objectives import BCQLoss
-from torchrl_bmrl.pipeline.agents import Student, load_bcq_loss, load_student
+from torchrl_bmrl.pipeline.agents import load_bcq_loss
 from torchrl_bmrl.pipeline.settings import SIX_TASKS, Settings
+from torchrl_bmrl.pipeline.student import Student, load_student
 from torchrl_bmrl.pipeline.task_files import make_tasks, read_task_file
 from torchrl_bmrl.run.locks import lock_run
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs

@@ -14,7 +14,8 @@ from torchrl_bmrl.objectives.checks import check_value_bounds
 from torchrl_bmrl.objectives.common import LOSS_FUNCTIONS
 from torchrl_bmrl.objectives.distillation import CONTEXTS, ENCODER_TERMS
 from torchrl_bmrl.objectives.generative import KL_REDUCTIONS
-from torchrl_bmrl.pipeline.agents import GENERATORS, LATENT_SOURCES, TASK_ENCODERS
+from torchrl_bmrl.pipeline.agents import GENERATORS
+from torchrl_bmrl.pipeline.student import LATENT_SOURCES, TASK_ENCODERS
 from torchrl_bmrl.run.folder import deciding
 from torchrl_bmrl.run.loggers import LOGGERS
 from torchrl_bmrl.run.settings import check_settings, setting
@@ -38,6 +39,8 @@ class CollectSettings:
         {"default": 60, **dict.fromkeys(SIX_TASKS, 60), "lift": 80}, above=0
     )
     valid_episodes: int = setting(6, above=0)  # held-out episodes of each task
+    # Episodes of each task in which the experts of the other tasks act, for distill.context=given.
+    context_episodes: int = setting(0, at_least=0)
     noise: float = setting(0.2, at_least=0)  # standard deviation in each action dimension
     # By task: tasks whose experts act before an episode, in turn, for starts as in a composition.
     after: dict[str, list[str]] = field(default_factory=dict)
@@ -124,13 +127,17 @@ class DistillSettings:
     context_size: int = setting(8, above=0)  # transitions in a set
     # Terms whose gradient trains the encoder.
     encoder_terms: list[str] = setting(list(ENCODER_TERMS), choices=ENCODER_TERMS)
-    classification_weight: float = setting(1.0, at_least=0)  # weight of the task's cross-entropy
+    # Weight of the task's cross-entropy; null: no classifier.
+    classification_weight: float | None = setting(1.0, at_least=0)
     generator_weight: float = setting(1.0, at_least=0)  # weight of the actions' loss
     direction_weight: float = setting(1.0, at_least=0)  # weight of the gradient direction
     qvalue_weight: float = setting(1.0, at_least=0)  # weight of the values' loss
     latent_norm_weight: float = setting(2e-3, at_least=0)  # weight of the squared norm of m
     metric_weight: float = setting(0.0, at_least=0)  # weight of the triplet loss on m
     metric_margin: float = setting(1.0, at_least=0)  # margin of the triplet loss
+    distance_weight: float = setting(0.0, at_least=0)  # weight of FOCAL's distance on m
+    contrastive_weight: float = setting(0.0, at_least=0)  # weight of InfoNCE on m
+    temperature: float = setting(0.1, above=0)  # temperature of InfoNCE
     isometry_weight: float = setting(1.0, at_least=0)  # weight of the isometry of m
     advantage_weight: float = setting(0.0, at_least=0)  # weight of differences within a state
     normalise_qvalue: bool = True  # with each teacher's mean and deviation

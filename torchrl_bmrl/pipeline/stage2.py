@@ -15,10 +15,10 @@ from torchrl_bmrl.data import make_multi_task_replay_buffer, with_previous
 from torchrl_bmrl.functional import nonzero_scale, sample_action_latent
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
-from torchrl_bmrl.pipeline.agents import Student, make_distillation_loss
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.settings import DistillSettings
 from torchrl_bmrl.pipeline.stage1 import sizes_of
+from torchrl_bmrl.pipeline.student import Student, make_distillation_loss
 from torchrl_bmrl.pipeline.training_data import deviation
 from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
 from torchrl_bmrl.run.workers import Report
