@@ -216,6 +216,7 @@ def record_ml1_episode(
     noise: float,
     gains: ExpertGains | None = None,
     after: Sequence[Task] = (),
+    like: Task | None = None,
 ) -> Episode:
     """Records one episode of Meta-World's scripted policy; ``seed`` reproduces it.
 
@@ -231,12 +232,14 @@ def record_ml1_episode(
         noise: standard deviation of the Gaussian noise on each action dimension.
         gains: ``None`` or the defaults, since scripted policies have none.
         after: nothing, since tasks of Meta-World cannot follow each other.
+        like: a task of the same environment whose goal the policy is shown instead; ``None`` for
+            this task's own. A policy that looks at the object alone acts as without it.
 
     Returns:
         the episode with the part ``observation`` and the extra ``successes``.
 
     Raises:
-        ConfigError: for ``gains`` or ``after``, and as
+        ConfigError: for ``gains``, ``after`` or a ``like`` of another environment, and as
             :class:`~torchrl_bmrl.envs.metaworld.MetaWorldEnv`.
 
     Example:
@@ -255,7 +258,12 @@ def record_ml1_episode(
     if after:
         names = ", ".join(task.name for task in after)
         raise ConfigError(f"{env} comes after {names}; valid: nothing before a task of Meta-World")
+    if like is not None and like.options.get("env") != env:
+        raise ConfigError(f"like is {like.name}; valid: a task of {env}")
     made = MetaWorldEnv(env, rand_vec, horizon)
+    goals = None if like is None else MetaWorldEnv(**like.options)
+    if goals is not None:
+        goals.reset()
     rng = np.random.default_rng(derive_seed(seed, "action noise"))
     policy = ENV_POLICY_MAP[env]()
     observation, _ = made.reset()
@@ -264,7 +272,10 @@ def record_ml1_episode(
         # The policy warns of actions that are clipped.
         warnings.filterwarnings("ignore", message="Constant", category=UserWarning)
         for _ in range(horizon):
-            action = np.clip(policy.get_action(made.observation_with_goal()), -1.0, 1.0)
+            shown = made.observation_with_goal()
+            if goals is not None:
+                shown[-3:] = goals.observation_with_goal()[-3:]
+            action = np.clip(policy.get_action(shown), -1.0, 1.0)
             action = np.clip(action + noise * rng.standard_normal(4), -1.0, 1.0)
             # float32, so that the executed action is the stored one to the bit.
             actions.append(action.astype(np.float32))
@@ -283,6 +294,7 @@ def record_ml1_episode(
         extras={"successes": np.array(successes)},
         attributes={
             "seed": seed,
+            **({} if like is None else {"like": like.name}),
             "env_args": {
                 "env_name": env,
                 "type": 2,
