@@ -74,6 +74,7 @@ _NEEDS = {
         "tests/weak_data.py",
         "torchrl_bmrl/reports/*",
     ],
+    "metaworld": ["torchrl_bmrl/envs/metaworld.py", "torchrl_bmrl/experts/metaworld.py"],
     "minari": ["tests/minari_files.py", "torchrl_bmrl/data/convert.py"],
     "mujoco": ["torchrl_bmrl/reports/films.py"],
     "onnxscript": ["torchrl_bmrl/export.py"],

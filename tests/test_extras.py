@@ -24,6 +24,7 @@ RECIPES = ROOT / "recipes"
 HIDDEN = {
     "robosuite": ["gymnasium", "llvmlite", "mujoco", "numba", "robosuite"],
     "data": ["h5py", "minari", "pyarrow", "tqdm"],
+    "metaworld": ["gymnasium", "metaworld"],
     "recipes": ["filelock", "hydra", "omegaconf", "onnx", "onnxscript", "safetensors", "yaml"],
     "reports": ["PIL", "jinja2", "matplotlib", "scipy", "sklearn", "threadpoolctl"],
     "everything": ["pytest", "tensorboard", "wandb"],
