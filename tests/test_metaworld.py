@@ -224,7 +224,7 @@ def test_episodes_of_a_task_are_equal_without_noise() -> None:
 
 def test_the_policy_of_another_task_goes_to_that_tasks_goal() -> None:
     other = get_task("ml1_reach_01")
-    episode = record("ml1_reach_00", 0, 0.1, like=other)
+    episode = record("ml1_reach_00", 0, 0.1, like=[other])
     assert episode.attributes["like"] == "ml1_reach_01"
     env = made("ml1_reach_01")
     env.reset()
@@ -340,8 +340,8 @@ def test_mistakes_are_this_librarys_errors() -> None:
         record(drawer.name, 0, 0.1, gains=ExpertGains(speed_limit=0.5))
     with pytest.raises(ConfigError, match="nothing before a task"):
         record(drawer.name, 0, 0.1, after=(drawer,))
-    with pytest.raises(ConfigError, match="a task of drawer-close-v3"):
-        record(drawer.name, 0, 0.1, like=get_task("ml1_push_00"))
+    with pytest.raises(ConfigError, match="tasks of drawer-close-v3"):
+        record(drawer.name, 0, 0.1, like=[get_task("ml1_push_00")])
     with pytest.raises(ConfigError, match="cannot follow each other"):
         get_task("ml1_drawer_close_00-ml1_drawer_close_01")
     with pytest.raises(ConfigError, match="no member has the parameter"):

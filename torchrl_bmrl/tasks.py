@@ -23,7 +23,11 @@ if TYPE_CHECKING:
 
     from torchrl_bmrl.data.episodes import Episode
 
-OWN_TASKS = ("torchrl_bmrl.experts.tabletop", "torchrl_bmrl.experts.sawyer_families")
+OWN_TASKS = (
+    "torchrl_bmrl.experts.tabletop",
+    "torchrl_bmrl.experts.sawyer_families",
+    "torchrl_bmrl.experts.metaworld",
+)
 """Modules that register this package's own tasks; they are imported when a name is looked up."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.]*")
 

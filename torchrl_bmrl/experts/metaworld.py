@@ -216,7 +216,7 @@ def record_ml1_episode(
     noise: float,
     gains: ExpertGains | None = None,
     after: Sequence[Task] = (),
-    like: Task | None = None,
+    like: Sequence[Task] = (),
 ) -> Episode:
     """Records one episode of Meta-World's scripted policy; ``seed`` reproduces it.
 
@@ -232,8 +232,8 @@ def record_ml1_episode(
         noise: standard deviation of the Gaussian noise on each action dimension.
         gains: ``None`` or the defaults, since scripted policies have none.
         after: nothing, since tasks of Meta-World cannot follow each other.
-        like: a task of the same environment whose goal the policy is shown instead; ``None`` for
-            this task's own. A policy that looks at the object alone acts as without it.
+        like: tasks of the same environment whose goals the policy is shown instead, each for its
+            share of the episode. A policy that looks at the object alone acts as without them.
 
     Returns:
         the episode with the part ``observation`` and the extra ``successes``.
@@ -258,12 +258,15 @@ def record_ml1_episode(
     if after:
         names = ", ".join(task.name for task in after)
         raise ConfigError(f"{env} comes after {names}; valid: nothing before a task of Meta-World")
-    if like is not None and like.options.get("env") != env:
-        raise ConfigError(f"like is {like.name}; valid: a task of {env}")
+    goals = []
+    for task in like:
+        if task.options.get("env") != env:
+            raise ConfigError(f"like is {task.name}; valid: tasks of {env}")
+        other = MetaWorldEnv(**task.options)
+        other.reset()
+        goals.append(other.observation_with_goal()[-3:])
+        other.close()
     made = MetaWorldEnv(env, rand_vec, horizon)
-    goals = None if like is None else MetaWorldEnv(**like.options)
-    if goals is not None:
-        goals.reset()
     rng = np.random.default_rng(derive_seed(seed, "action noise"))
     policy = ENV_POLICY_MAP[env]()
     observation, _ = made.reset()
@@ -271,10 +274,10 @@ def record_ml1_episode(
     with warnings.catch_warnings():
         # The policy warns of actions that are clipped.
         warnings.filterwarnings("ignore", message="Constant", category=UserWarning)
-        for _ in range(horizon):
+        for step in range(horizon):
             shown = made.observation_with_goal()
-            if goals is not None:
-                shown[-3:] = goals.observation_with_goal()[-3:]
+            if goals:
+                shown[-3:] = goals[step * len(goals) // horizon]
             action = np.clip(policy.get_action(shown), -1.0, 1.0)
             action = np.clip(action + noise * rng.standard_normal(4), -1.0, 1.0)
             # float32, so that the executed action is the stored one to the bit.
@@ -294,7 +297,7 @@ def record_ml1_episode(
         extras={"successes": np.array(successes)},
         attributes={
             "seed": seed,
-            **({} if like is None else {"like": like.name}),
+            **({"like": ", ".join(task.name for task in like)} if like else {}),
             "env_args": {
                 "env_name": env,
                 "type": 2,
@@ -305,6 +308,6 @@ def record_ml1_episode(
     )
 
 
-registered_families()  # this library's own come first, whatever is imported first
+registered_families()  # the Sawyer's come first, whatever is imported first
 for _env in SPACES:
     register_family(make_ml1_family(_env))
