@@ -123,13 +123,6 @@ def loss_options(settings: DistillSettings) -> dict[str, Any]:
     return {name: x for name, x in vars(settings).items() if name not in others}
 
 
-def step_scale(datasets: list[TensorDictBase]) -> list[float]:
-    """Returns the standard deviation of each number's change in a step, over all tasks."""
-    steps = torch.cat([x["next", "observation"] - x["observation"] for x in datasets])
-    deviation = steps.double().std(0)
-    return torch.where(deviation > 1e-6, deviation, 1.0).tolist()
-
-
 def make_sampler(
     run: Run, distill: DistillSettings, train: list[TensorDictBase]
 ) -> Callable[[], TensorDictBase]:
@@ -178,11 +171,14 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
         "num_tasks": len(run.names),
         **{name: getattr(distill, name) for name in OF_THE_STUDENT},
         "latent_dim": teachers[0].latent_dim,
-        "step_scale": step_scale(train) if distill.task_encoder in OF_SETS else None,
-        "codes": run.codes() if distill.task_encoder == "told" else None,
+        **({"code_dim": len(run.codes()[0])} if distill.task_encoder == "told" else {}),
         **sizes_of(train[0]),
     }
     student = Student(**options)
+    if distill.task_encoder == "told":
+        student.set_codes(run.codes())
+    elif distill.task_encoder in OF_SETS:
+        student.set_step_scale(train)
     normalisation = value_statistics(teachers, train) if distill.normalise_qvalue else (None, None)
     loss = make_distillation_loss(
         student,

@@ -7,7 +7,7 @@ import re
 import reprlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -46,10 +46,9 @@ class Student(nn.Module):
         action_dim: size of the action.
         task_encoder: ``"transition"``; ``"set_mean"`` or ``"set_attention"``: m of a set of
             transitions; ``"one_hot"``: m is the task's index, one-hot; ``"told"``: m is given by
-            ``codes``; ``"nothing"``: m is one zero.
+            :meth:`set_codes`; ``"nothing"``: m is one zero.
         task_latent_dim: size of m, except for the last two.
-        step_scale: of an encoder of sets, see :func:`~torchrl_bmrl.modules.make_context_encoder`.
-        codes: numbers that the policy is told about each task, ``(num_tasks, n)``.
+        code_dim: numbers that the policy is told about a task, see :meth:`set_codes`.
         num_cells: widths of the hidden layers.
         latent_dim: size of the teachers' ``action_latent``; by default twice the action's.
 
@@ -79,8 +78,7 @@ class Student(nn.Module):
         task_latent_dim: int = 2,
         num_cells: Sequence[int] = (256, 256),
         latent_dim: int | None = None,
-        step_scale: Sequence[float] | None = None,
-        codes: Sequence[Sequence[float]] | None = None,
+        code_dim: int = 1,
     ) -> None:
         super().__init__()
         dims = (observation_dim, action_dim)
@@ -91,17 +89,14 @@ class Student(nn.Module):
             task_latent_dim = num_tasks
             self.task_encoder = make_one_hot_encoder(num_tasks)
         elif task_encoder in ("told", "nothing"):
-            codes = codes if task_encoder == "told" else [[0.0]] * num_tasks
-            table = torch.tensor(codes, dtype=torch.get_default_dtype())
-            task_latent_dim = table.shape[-1]
-            self.task_encoder = make_told_encoder(table)
+            task_latent_dim = code_dim
+            self.task_encoder = make_told_encoder(torch.zeros(num_tasks, code_dim))
         elif task_encoder in OF_SETS:
             self.task_encoder = make_context_encoder(
                 *dims,
                 task_latent_dim,
                 pooling=task_encoder.removeprefix("set_"),
                 num_cells=num_cells,
-                step_scale=step_scale,
             )
         else:
             self.task_encoder = make_task_encoder(*dims, task_latent_dim, num_cells=num_cells)
@@ -127,6 +122,27 @@ class Student(nn.Module):
         if reads_context(self.task_encoder):
             raise BMRLError("the encoder reads sets of transitions; valid: embed_context")
         return self.task_encoder(data.select(*self.task_encoder.in_keys)).get("task_latent")
+
+    def set_codes(self, codes: Sequence[Sequence[float]]) -> None:
+        """Sets what the encoder ``"told"`` writes.
+
+        Args:
+            codes: numbers of each task, ``(num_tasks, code_dim)``.
+        """
+        held = cast(Tensor, self.task_encoder.module.codes)
+        held.copy_(torch.tensor(codes, dtype=held.dtype))
+
+    def set_step_scale(self, datasets: Sequence[TensorDictBase]) -> None:
+        """Tells an encoder of sets how far each number of the observation moves in a step.
+
+        Args:
+            datasets: training transitions, ``[N_i]`` each.
+        """
+        steps = torch.cat([x["next", "observation"] - x["observation"] for x in datasets])
+        deviation = steps.double().std(0)
+        held = cast(Tensor, self.task_encoder.module.step_scale)
+        # A number that hardly moves carries rounding errors, which must not be enlarged.
+        held.copy_(torch.where(deviation > 1e-3, deviation, 1.0))
 
     def embed_context(self, context: TensorDictBase) -> Tensor:
         """Returns the embedding m of a set of transitions of one task, ``(*B, task_latent_dim)``.
