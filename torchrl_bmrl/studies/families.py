@@ -34,6 +34,7 @@ from torchrl_bmrl.reports import Section, write_study
 from torchrl_bmrl.run.folder import open_run
 from torchrl_bmrl.run.settings import setting
 from torchrl_bmrl.run.workers import Report
+from torchrl_bmrl.studies.families_line import LINES, POINTS, line_table, lines_of, play_line
 from torchrl_bmrl.studies.families_report import make_table
 from torchrl_bmrl.studies.imitation import clone_behaviour
 from torchrl_bmrl.tasks import SPLITS, Task
@@ -81,15 +82,16 @@ _OTHERS: dict[str, str] = {"told": "told", "one_hot": "one_hot", "no_context": "
 def generalise(run: Run, settings: FamilySettings) -> str:
     """Plays the held-out members of the run's family with every method.
 
-    Trains the students of the comparison first. Writes ``families/results.csv`` and the table
-    ``families``. Students and episodes that are there already are read back.
+    Trains the students of the comparison first, and also plays points between trained members.
+    Writes ``families/results.csv`` and ``families/lines.csv`` with a table each. Students and
+    episodes that are there already are read back.
 
     Args:
         run: an open run with stage 2, whose tasks are the trained members of a family.
         settings: of the study.
 
     Returns:
-        the table as Markdown.
+        the tables as Markdown.
 
     Raises:
         BMRLError: for settings that are not valid, or a missing policy.
@@ -120,7 +122,27 @@ def generalise(run: Run, settings: FamilySettings) -> str:
     table = make_table(family.title, {name: METHODS[name] for name in methods}, rows)
     section = Section(heading="Tasks that nobody trained on", tables=[table])
     write_study(run.folder, "families", section, {})
-    return table.markdown()
+    if family.measure is None or "one_hot" not in methods:
+        return table.markdown()
+    lines = [(settings, code, pair) for code in LINES for pair in lines_of(run)]
+    steps = sum(run.horizon(run.task(start)) for _, _, (start, _) in lines)
+    results = run.jobs(
+        play_line,
+        lines,
+        total=steps * settings.episodes * POINTS,
+        description="playing between members",
+        unit="step",
+    )
+    rows = [row for part in results for row in part]
+    write_rows(run.folder / settings.folder / "lines.csv", rows)
+    second = line_table(family.title, rows)
+    write_study(
+        run.folder,
+        "families_lines",
+        Section(heading="Between trained members", tables=[second]),
+        {},
+    )
+    return f"{table.markdown()}\n{second.markdown()}"
 
 
 def student_job(run: Run, settings: FamilySettings, method: str) -> StudentJob:
