@@ -194,7 +194,7 @@ def moved_speed(observation: Tensor) -> tuple[float]:
     return (1000 * most * CONTROL_FREQUENCY / steps,)
 
 
-_POINTS = _points(32, (-12, -20, 6), (12, 20, 32))
+_POINTS = _points(24, (-12, -20, 6), (12, 20, 32))
 
 register_family(
     Family(

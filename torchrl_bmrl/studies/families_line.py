@@ -63,10 +63,10 @@ def play_line(
             num_candidates=run.settings.evaluate.num_candidates,
             latent_clip=metadata["latent_clip"],
         )
-        ends = [student.prototypes[run.names.index(name)] for name in (start, end)]
+        first, last = (student.prototypes[run.names.index(name)] for name in (start, end))
         task, family = run.task(start), run.family
         shares = torch.linspace(0, 1, POINTS).repeat_interleave(settings.episodes)
-        points = torch.lerp(*ends, shares.unsqueeze(-1)).unsqueeze(1)
+        points = torch.lerp(first, last, shares.unsqueeze(-1)).unsqueeze(1)
         seeds = [run.seed("families", "line", start, i) for i in range(settings.episodes)]
         transform = PathTaskLatent(points)
         with closing(run.make_env(task, transform, num_envs=len(points))) as env:
