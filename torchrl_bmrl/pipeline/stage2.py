@@ -143,9 +143,10 @@ def make_sampler(
     buffers = [make_multi_task_replay_buffer(data, **options) for data in (own, others)]
 
     def sample() -> TensorDictBase:
-        # Contexts of one behaviour, of the other, and mixed.
+        # A third of the contexts are of one behaviour alone, a third of the other: with a single
+        # demonstrated transition the encoder would not have to look at rewards.
         first, second = (contexts.sample().exclude("index") for contexts in buffers)
-        share = torch.rand(len(train), 1, device=first.device)
+        share = (3 * torch.rand(len(train), 1, device=first.device) - 1).clamp(0, 1)
         chosen = torch.rand(first.batch_size, device=first.device) < share
         return buffer.sample().set("context", torch.where(chosen, first, second))
 
