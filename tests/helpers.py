@@ -25,7 +25,9 @@ from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.generators import Autoencoder
 from torchrl_bmrl.modules import (
     ActionVAE,
+    make_context_encoder,
     make_decoder,
+    make_gaussian_actor,
     make_latent_actor,
     make_perturbation_network,
     make_qvalue_network,
@@ -36,6 +38,7 @@ from torchrl_bmrl.modules.generator import make_mlp
 from torchrl_bmrl.objectives import (
     BCQLoss,
     DiscreteBCQLoss,
+    FOCALLoss,
     FQELoss,
     MetaDistillationLoss,
     PLASLoss,
@@ -259,6 +262,48 @@ def make_distillation_loss(
 ) -> MetaDistillationLoss:
     """A small loss with teachers of its own."""
     return distillation_case(num_tasks=num_tasks, teachers=teachers).make(**options)
+
+
+def focal_networks() -> dict[str, Any]:
+    latent = {"task_latent_dim": TASK_LATENT_DIM, "num_cells": CELLS}
+    return {
+        M: make_context_encoder(*DIMS, TASK_LATENT_DIM, num_features=4, num_cells=CELLS),
+        ACTOR: make_gaussian_actor(*DIMS, **latent),
+        "divergence_network": make_qvalue_network(*DIMS, **latent),
+        Q: make_qvalue_network(*DIMS, **latent),
+    }
+
+
+def task_data(*shape: int, **options: Any) -> TensorDict:
+    """Random transitions with an m, which critics alone can read."""
+    data = transitions(*shape, **options)
+    data["task_latent"] = transitions(*shape, **options, seed=2)["action"]
+    return data
+
+
+def focal_case(**options: Any) -> Case:
+    return Case(
+        FOCALLoss,
+        focal_networks,
+        {
+            "encoder": {M},
+            "divergence": {"divergence_network"},
+            "qvalue": {Q},
+            "actor": {ACTOR},
+        },
+        (Q,),
+        BOUNDS | {"context_size": 2, "divergence_weight": 1.0} | options,
+        task_data,
+        shape=(TASKS, 6),
+        need_not_fall=("actor", "divergence"),
+        mixes_rows=True,
+        by_task=True,
+    )
+
+
+def make_focal_loss(**options: Any) -> FOCALLoss:
+    """A small loss whose target networks differ from the trained ones."""
+    return focal_case().make(**options)
 
 
 def guide(name: str = "extending") -> ModuleType:

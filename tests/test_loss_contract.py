@@ -25,6 +25,7 @@ from helpers import (
     bcq_case,
     discrete_bcq_case,
     distillation_case,
+    focal_case,
     fqe_case,
     guide,
     plas_case,
@@ -53,6 +54,8 @@ OFFLINE = {
     "discrete_bcq": discrete_bcq_case(),
     "discrete_bcq_categorical": discrete_bcq_case("categorical"),
     "fqe": fqe_case(),
+    "focal": focal_case(),
+    "focal_value_penalty": focal_case(value_penalty=True),
 }
 STUDENTS = {
     "distillation": distillation_case(context="current"),
@@ -153,7 +156,7 @@ def test_inductor_gives_the_same_values() -> None:
 
 SPEC = Bounded(low=torch.tensor([-1.0, -2.0]), high=torch.tensor([0.5, 3.0]), shape=(2,))
 VAE = ("bcq", "plas")
-BOUNDED = (*VAE, "rebrac")
+BOUNDED = (*VAE, "rebrac", "focal")
 BAD_OPTIONS = [
     (CASES, {"reduction": "avg"}, "'avg'; valid .*: mean, sum, none"),
     (OFFLINE, {"loss_function": "huber"}, "'huber'; valid .*: l2, l1, smooth_l1"),
@@ -168,6 +171,9 @@ BAD_OPTIONS = [
     (["bcq"], {"value_bounds": (1.0, 0.0)}, r"value_bounds are \(1.0, 0.0\); valid: \(low, high"),
     (["rebrac"], {"actor_penalty": -0.1}, "actor_penalty is -0.1; valid: at least 0"),
     (["rebrac"], {"critic_penalty": -0.1}, "critic_penalty is -0.1; valid: at least 0"),
+    (["focal"], {"context_size": 0}, "context_size is 0; valid: at least 1"),
+    (["focal"], {"divergence_weight": 401.0}, "divergence_weight is 401.0; valid: between 0 and"),
+    (["focal"], {"entropy_weight": -1.0}, "entropy_weight is -1.0; valid: at least 0"),
     (["discrete_bcq"], {"threshold": 1.5}, "threshold is 1.5; valid: between 0 and 1"),
     (["discrete_bcq"], {"action_space": "box"}, "'box'; valid .*: one-hot, categorical"),
     (STUDENTS, {"context": "next"}, "'next'; valid .*: current, previous, random, set"),

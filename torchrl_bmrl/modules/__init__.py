@@ -6,6 +6,7 @@ from torchrl_bmrl.modules.discrete_policy import DiscreteBCQPolicy
 from torchrl_bmrl.modules.ensemble import EnsembleCritic
 from torchrl_bmrl.modules.flow import ActionFlow
 from torchrl_bmrl.modules.following import LossPolicy, extract_critic, extract_network
+from torchrl_bmrl.modules.gaussian_actor import make_gaussian_actor
 from torchrl_bmrl.modules.generator import (
     ActionVAE,
     make_decoder,
@@ -46,6 +47,7 @@ __all__ = [
     "extract_critic",
     "extract_network",
     "make_decoder",
+    "make_gaussian_actor",
     "make_latent_actor",
     "make_one_hot_encoder",
     "make_perturbation_network",
