@@ -154,7 +154,7 @@ def test_metric_term_is_zero_where_the_tasks_lie_far_apart() -> None:
 
 
 def test_metric_term_needs_two_tasks() -> None:
-    with pytest.raises(BMRLError, match="metric_weight needs at least two tasks"):
+    with pytest.raises(BMRLError, match=r"metric_weight, .* need at least two tasks"):
         make_distillation_loss(num_tasks=1, metric_weight=1.0)
     loss = make_distillation_loss(num_tasks=1)
     assert "loss_metric" not in loss(task_transitions(1, ROWS))

@@ -292,9 +292,7 @@ class TabletopScene(ManipulationEnv):
     # -- state ---------------------------------------------------------------------------------
 
     def episode_state(self) -> dict[str, np.ndarray]:
-        """State besides the simulator's: ``goal_start``; ``stage`` and ``targets`` of compositions;
-        for timed skills ``start`` (4,), position and step of the stage's start.
-        """
+        """The episode's state besides the simulator's, as ``TabletopEnv.get_state`` lists it."""
         state = {"goal_start": self.goal_start}
         if any(skill.timed for skill in self.skills):
             state["start"] = np.append(self.start_position, self._start_step)

@@ -213,8 +213,9 @@ class TabletopEnv(gymnasium.Env):
 
         ``physics``: MuJoCo's integration state (positions, velocities, warm start, controls, time);
         ``gripper`` and ``rest_joints``: internal state of robosuite's gripper and arm controllers;
-        ``goal_start``; in compositions ``stage`` and ``targets``; number of ``steps``; ``rng``,
-        which decides later resets. ``np.savez`` can save it.
+        ``goal_start`` (3,); in compositions ``stage`` (1,) and ``targets`` (stages, 3); with timed
+        skills ``start`` (4,), position and step at which the skill began; number of ``steps``;
+        ``rng``, which decides later resets. ``np.savez`` can save it.
 
         It is exact for controllers that do not interpolate goals, such as the arms' default ones.
         """

@@ -1,6 +1,14 @@
 """Networks, policies, and the task embedding."""
 
 from torchrl_bmrl.modules.chunk_policy import ChunkPolicy
+from torchrl_bmrl.modules.context_encoder import (
+    ContextTaskLatent,
+    as_context,
+    embed_context,
+    make_context_encoder,
+    make_told_encoder,
+    reads_context,
+)
 from torchrl_bmrl.modules.demonstration_latent import DemonstrationTaskLatent
 from torchrl_bmrl.modules.discrete_policy import DiscreteBCQPolicy
 from torchrl_bmrl.modules.ensemble import EnsembleCritic
@@ -34,6 +42,7 @@ __all__ = [
     "ActionVAE",
     "BCQPolicy",
     "ChunkPolicy",
+    "ContextTaskLatent",
     "DemonstrationTaskLatent",
     "DiscreteBCQPolicy",
     "EnsembleCritic",
@@ -44,8 +53,11 @@ __all__ = [
     "PathTaskLatent",
     "PrototypeTaskLatent",
     "StageTaskLatent",
+    "as_context",
+    "embed_context",
     "extract_critic",
     "extract_network",
+    "make_context_encoder",
     "make_decoder",
     "make_gaussian_actor",
     "make_latent_actor",
@@ -54,6 +66,8 @@ __all__ = [
     "make_qvalue_network",
     "make_task_classifier",
     "make_task_encoder",
+    "make_told_encoder",
     "prototype",
+    "reads_context",
     "task_latent_box",
 ]

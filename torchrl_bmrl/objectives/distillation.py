@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams, unravel_key
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torch.nn import functional as F
 
 from torchrl_bmrl import functional
 from torchrl_bmrl.errors import BMRLError
@@ -21,12 +20,23 @@ from torchrl_bmrl.objectives.checks import check_choice, check_number
 from torchrl_bmrl.objectives.data import check_same_shape, check_tasks, entry, next_key, select
 from torchrl_bmrl.objectives.ensemble import FrozenEnsemble
 from torchrl_bmrl.objectives.sizes import is_lazy, shapes_of, warm_up
-from torchrl_bmrl.objectives.student_terms import advantage, isometry
-from torchrl_bmrl.objectives.task_rows import draw_others, draw_rows
+from torchrl_bmrl.objectives.student_terms import (
+    advantage,
+    arranging_errors,
+    check_options,
+    classify,
+    embed_rows,
+    embed_sets,
+    encoded_keys,
+    isometry,
+    reads_sets,
+)
 from torchrl_bmrl.objectives.teachers import check_teachers, per_task
 
-CONTEXTS = ("current", "previous", "random", "set")
+CONTEXTS = ("current", "previous", "random", "set", "given")
+OF_SETS = ("set", "given")
 ENCODER_TERMS = ("classification", "generator", "direction", "qvalue", "metric")
+ARRANGING_TERMS = ("metric", "distance", "contrastive")
 OTHER_TERMS = ("isometry", "advantage")
 
 
@@ -50,10 +60,14 @@ class MetaDistillationLoss(KeyedLoss):
     Deviations from the paper are the penalty on m, the normalised :math:`\tilde Q_i = (Q_i -
     \mu_i)/\sigma_i` and ``context``; docs/distillation.md explains them. The last three terms
     are off by default: in the triplet loss (https://arxiv.org/abs/1909.11373) :math:`m^+` embeds
-    another transition of the task and :math:`m^-` one of another task; the isometry term makes
-    distances in m equal those in c, the reward and the teacher's action, over all pairs of a task's
-    rows; the advantage term compares the values of two latents of a state, since a policy chooses
-    only by such differences.
+    another transition or set of the task and :math:`m^-` one of another task; the isometry term
+    makes distances in m equal those in c, the reward and the teacher's action, over all pairs of a
+    task's rows; the advantage term compares the values of two latents of a state, since a policy
+    chooses only by such differences. Two more arrange m as the triplet loss does:
+    :func:`~torchrl_bmrl.contrast.distance_error` and
+    :func:`~torchrl_bmrl.contrast.contrastive_error`.
+    An encoder of sets (:func:`~torchrl_bmrl.modules.make_context_encoder`) embeds groups of a
+    task's rows instead, for tasks that nobody trained on.
     :math:`\hat Q` is trained at :math:`\hat g` without a gradient into the student's generator.
 
     The teachers are frozen. Row i of the data belongs to task i. Teachers of equal shapes run as
@@ -61,7 +75,7 @@ class MetaDistillationLoss(KeyedLoss):
 
     Args:
         task_encoder: M, (observation, action, next reward, next observation) → ``task_latent``.
-        task_classifier: P, ``task_latent`` → ``task_logits``.
+        task_classifier: P, ``task_latent`` → ``task_logits``; ``None`` for no classification.
         student_generator: Ĝ, a decoder of observation, ``action_latent``, ``task_latent``.
         student_qvalue_network: Q̂, of observation, action, ``task_latent``.
         teacher_generators: one decoder per task (observation, ``action_latent`` → action).
@@ -77,21 +91,27 @@ class MetaDistillationLoss(KeyedLoss):
         qvalue_weight, latent_norm_weight: w_q, w_m.
         metric_weight, isometry_weight, advantage_weight: w_t, w_s, w_a; 0 leaves the term out.
         metric_margin: α, in units of m.
+        distance_weight, contrastive_weight: of FOCAL's distance and of InfoNCE; likewise.
+        temperature: τ of InfoNCE.
         encoder_terms: terms whose gradient reaches M, of ``"classification"``, ``"generator"``,
-            ``"direction"``, ``"qvalue"`` (the advantage term, too) and ``"metric"``; the penalty on
-            m and the isometry term always reach it. ``("classification",)`` is the paper's reading.
+            ``"direction"``, ``"qvalue"`` (the advantage term, too) and ``"metric"`` (distance and
+            InfoNCE, too); the penalty on m and the isometry term always reach it.
+            ``("classification",)`` is the paper's reading.
         context: which transition m is computed from: ``"current"`` (the paper's), ``"previous"``
             (the one before it in the episode, under the key ``"previous"``), ``"random"`` (another
             one of the task in the batch) or ``"set"`` (the mean over ``context_size`` random ones).
+            An encoder of sets reads ``"set"``, groups of the batch's rows without the row itself,
+            or ``"given"``, groups of the rows under ``"context"``, perhaps of another behaviour.
         context_fraction: share of each batch that uses ``context``; the rest uses ``"current"``.
-        context_size: transitions in a set.
+            With an encoder of sets 1.
+        context_size: transitions in a set; for an encoder of sets the largest number.
         **options: of :class:`~torchrl_bmrl.objectives.KeyedLoss`: ``reduction``,
             ``deactivate_vmap`` (runs the teachers in a loop), ``use_prioritized_weights``.
 
     Keys read, batch ``[num_tasks, B]``: ``observation``, ``action``, ``("next", "reward")``,
     ``("next", "observation")``, ``task`` (class index, int64), with ``context="previous"`` the same
-    under ``"previous"``. Key written to the input: ``td_error (num_tasks, B)``, the priority: the
-    sum of a row's terms.
+    under ``"previous"``, with ``"given"`` under ``"context"``. Key written to the input:
+    ``td_error (num_tasks, B)``, the priority: the sum of a row's terms.
 
     Raises:
         BMRLError: for invalid teachers or options; and at a call for data without one row per
@@ -133,7 +153,8 @@ class MetaDistillationLoss(KeyedLoss):
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     _schedulable_buffers = frozenset(
-        {"latent_clip", *(f"{x}_weight" for x in (*ENCODER_TERMS, "latent_norm", *OTHER_TERMS))}
+        {"latent_clip", "latent_norm_weight"}
+        | {f"{x}_weight" for x in (*ENCODER_TERMS, *ARRANGING_TERMS, *OTHER_TERMS)}
     )
     task_encoder: TensorDictModule
     task_encoder_params: TensorDictParams
@@ -151,7 +172,7 @@ class MetaDistillationLoss(KeyedLoss):
     def __init__(
         self,
         task_encoder: TensorDictModule,
-        task_classifier: TensorDictModule,
+        task_classifier: TensorDictModule | None,
         student_generator: TensorDictModule,
         student_qvalue_network: TensorDictModule,
         teacher_generators: Sequence[TensorDictModule],
@@ -169,6 +190,9 @@ class MetaDistillationLoss(KeyedLoss):
         latent_norm_weight: float = 2e-3,
         metric_weight: float = 0.0,
         metric_margin: float = 1.0,
+        distance_weight: float = 0.0,
+        contrastive_weight: float = 0.0,
+        temperature: float = 0.1,
         isometry_weight: float = 0.0,
         advantage_weight: float = 0.0,
         advantage_scale: Tensor | None = None,
@@ -181,17 +205,20 @@ class MetaDistillationLoss(KeyedLoss):
         super().__init__(**options)
         terms = (encoder_terms,) if isinstance(encoder_terms, str) else encoder_terms
         self.encoder_terms = tuple(check_choice("encoder term", x, ENCODER_TERMS) for x in terms)
-        if metric_weight and len(teacher_generators) < 2:
-            raise BMRLError("metric_weight needs at least two tasks")
         self.num_tasks = len(teacher_generators)
         self.latent_dim = check_number("latent_dim", latent_dim, 1, integer=True)
         self.context = check_choice("context", context, CONTEXTS)
         self.context_fraction = check_number("context_fraction", context_fraction, 0, 1)
         self.context_size = check_number("context_size", context_size, 1, integer=True)
         self.metric_margin = check_number("metric_margin", metric_margin)
+        self.temperature = check_number("temperature", temperature, 1e-6)
+        self.reads_sets = reads_sets(task_encoder)
+        check_options(self, isometry_weight, (metric_weight, distance_weight, contrastive_weight))
         names = ("task_encoder", "task_classifier", "student_generator", "student_qvalue_network")
         networks = (task_encoder, task_classifier, student_generator, student_qvalue_network)
-        students = dict(zip(names, networks, strict=True))
+        pairs = zip(names, networks, strict=True)
+        students = {name: network for name, network in pairs if network is not None}
+        self.classifies = task_classifier is not None
         teachers = (teacher_generators, teacher_qvalue_networks)
         check_teachers(students, *teachers, self.tensor_keys.action_latent, self.latent_dim)
         self._cold = any(map(is_lazy, students.values()))
@@ -205,7 +232,6 @@ class MetaDistillationLoss(KeyedLoss):
             name = f"{name}_scale"
             self.register_buffer(name, per_task(name, scale, like + 1))
         self.register_coefficients(
-            classification_weight=classification_weight,
             generator_weight=generator_weight,
             direction_weight=direction_weight,
             qvalue_weight=qvalue_weight,
@@ -214,7 +240,10 @@ class MetaDistillationLoss(KeyedLoss):
         self.register_coefficients(
             optional=True,
             latent_clip=latent_clip,
+            classification_weight=classification_weight if self.classifies else None,
             metric_weight=metric_weight or None,
+            distance_weight=distance_weight or None,
+            contrastive_weight=contrastive_weight or None,
             isometry_weight=isometry_weight or None,
             advantage_weight=advantage_weight or None,
         )
@@ -227,28 +256,26 @@ class MetaDistillationLoss(KeyedLoss):
         shapes = shapes_of(tensordict, self.in_keys, 2) | {keys.action_latent: (self.latent_dim,)}
         warm_up("task_encoder", self.task_encoder, shapes)
         with torch.no_grad():
-            shapes[keys.task_latent] = self._encode(tensordict).shape[2:]
-        for name in ("task_classifier", "student_generator", "student_qvalue_network"):
+            shapes[keys.task_latent] = self.embed(tensordict).shape[2:]
+        classifier = ("task_classifier",) if self.classifies else ()
+        for name in (*classifier, "student_generator", "student_qvalue_network"):
             warm_up(name, getattr(self, name), shapes)
 
     def read_keys(self) -> list[NestedKey]:
         """The transition that m is computed from, what the teachers read, and the task."""
-        keys = [*self.task_encoder.in_keys, *self._teacher_observation_keys]
-        keys.append(self.tensor_keys.task)
+        keys = [*encoded_keys(self), *self._teacher_observation_keys, self.tensor_keys.task]
         if self.isometry_weight is not None:
             reward = next_key(self.tensor_keys.reward)
             keys += [reward] if reward not in keys else []
-        if self.context == "previous":
-            previous = self.tensor_keys.previous
-            keys += [unravel_key((previous, key)) for key in self.task_encoder.in_keys]
         return keys
 
     def written_keys(self) -> list[str]:
         """The weighted terms, then metrics."""
-        terms = ["classification", "generator", "direction", "qvalue", "latent_norm"]
-        optional = ("metric", *OTHER_TERMS)
-        terms += [x for x in optional if getattr(self, f"{x}_weight") is not None]
-        return [*(f"loss_{term}" for term in terms), "accuracy", "latent_norm"]
+        first = ["classification"] * self.classifies
+        optional = (*ARRANGING_TERMS, *OTHER_TERMS)
+        chosen = [x for x in optional if getattr(self, f"{x}_weight") is not None]
+        terms = [*first, "generator", "direction", "qvalue", "latent_norm", *chosen]
+        return [*(f"loss_{x}" for x in terms), *["accuracy"] * self.classifies, "latent_norm"]
 
     @property
     def _teacher_observation_keys(self) -> list[NestedKey]:
@@ -264,23 +291,11 @@ class MetaDistillationLoss(KeyedLoss):
         Raises:
             BMRLError: for missing keys, and for ``context="previous"`` without ``"previous"``.
         """
-        latent = self._encode(tensordict)
-        if self.context == "current":
-            return latent
-        if self.context == "previous":
-            name = self.tensor_keys.previous
-            if tensordict.get(name, None) is None:
-                raise BMRLError(
-                    f"the data have no {name!r}, which context='previous' reads; valid: data of "
-                    "torchrl_bmrl.data.with_previous, or the context current, random or set"
-                )
-            other = self._encode(tensordict, under=name)
-        else:
-            # The other rows of a task are draws from its data, and so are its context.
-            size = self.context_size if self.context == "set" else 1
-            other = draw_rows(latent, self.valid_rows(tensordict, latent.shape[:2]), size).mean(2)
-        chosen = torch.rand(latent.shape[:2], device=latent.device) < self.context_fraction
-        return torch.where(chosen.unsqueeze(-1), other, latent)
+        return self._embed(tensordict)[0]
+
+    def _embed(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """m of each row; and the embeddings of which the arranging terms compare pairs."""
+        return embed_sets(self, tensordict) if self.reads_sets else embed_rows(self, tensordict)
 
     def _entries(
         self, tensordict: TensorDictBase, keys: Iterable[NestedKey], under: NestedKey = ()
@@ -344,18 +359,13 @@ class MetaDistillationLoss(KeyedLoss):
         valid = self.valid_rows(tensordict, batch)
         task = entry(tensordict, keys.task, valid)
         check_tasks(keys.task, task, batch, valid)
-        m = self.embed(tensordict)
+        m, compared = self._embed(tensordict)
         # M receives the gradients of the chosen terms only.
         reaching = {term: m if term in self.encoder_terms else m.detach() for term in ENCODER_TERMS}
-        logits = self._run(
-            "task_classifier",
-            TensorDict({keys.task_latent: reaching["classification"]}, batch),
-            keys.task_logits,
-            like=m.new_empty(*batch, self.num_tasks),
-        )
-        cross_entropy = F.cross_entropy(
-            logits.flatten(0, 1), task.flatten().long(), reduction="none"
-        )
+        terms, metrics = {}, {}
+        if self.classifies:
+            error, metrics["accuracy"] = classify(self, reaching["classification"], task, valid)
+            terms["loss_classification"] = self.classification_weight * error
         taught = self.teach(tensordict)
         states = taught.select(*self._teacher_observation_keys)
         target, target_value = taught.get(keys.action), taught.get(keys.state_action_value)
@@ -372,17 +382,16 @@ class MetaDistillationLoss(KeyedLoss):
         value = self._run("student_qvalue_network", states, key, target_value, given)
         error = (value - target_value).squeeze(-1)
         norm = m.square().sum(-1)
-        terms = {
-            "loss_classification": self.classification_weight * cross_entropy.view_as(task),
+        terms |= {
             "loss_generator": self.generator_weight * functional.squared_error(action, target),
             "loss_direction": self.direction_weight * functional.direction_error(directed, target),
             "loss_qvalue": self.qvalue_weight * error.square(),
             "loss_latent_norm": self.latent_norm_weight * norm,
         }
-        if self.metric_weight is not None:
-            near, far = draw_others(reaching["metric"], valid)
-            triplet = functional.triplet_error(reaching["metric"], near, far, self.metric_margin)
-            terms["loss_metric"] = self.metric_weight * triplet
+        if "metric" not in self.encoder_terms:
+            compared = compared.detach()
+        for term, error in arranging_errors(self, compared, tensordict).items():
+            terms[f"loss_{term}"] = getattr(self, f"{term}_weight") * error
         if self.isometry_weight is not None:
             terms["loss_isometry"] = self.isometry_weight * isometry(self, tensordict)
         if self.advantage_weight is not None:
@@ -391,6 +400,5 @@ class MetaDistillationLoss(KeyedLoss):
         priority = sum(terms.values()).detach()
         tensordict.set(self.tensor_keys.priority, functional.unpadded(priority, valid))
         losses = {name: self.reduce(term, tensordict) for name, term in terms.items()}
-        losses["accuracy"] = functional.average((logits.argmax(-1) == task).to(logits.dtype), valid)
-        losses["latent_norm"] = functional.average(norm, valid).sqrt()
-        return TensorDict(losses)
+        metrics["latent_norm"] = functional.average(norm, valid).sqrt()
+        return TensorDict(losses | metrics)

@@ -1,15 +1,23 @@
-"""Terms of the distillation that compare pairs: rows of a task, and latents of a state."""
+"""Parts of the distillation: m of sets of rows, and terms that compare pairs."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
 from torch import Tensor
+from torch.nn import functional as F
 
 from torchrl_bmrl import functional
+from torchrl_bmrl.contrast import contrastive_error, distance_error
+from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.objectives.contexts import CONTEXT, assign, group_rows
 from torchrl_bmrl.objectives.data import entry, next_key
+from torchrl_bmrl.objectives.task_rows import draw_others, draw_rows
 
 if TYPE_CHECKING:
     from torchrl_bmrl.objectives.distillation import MetaDistillationLoss
@@ -58,3 +66,142 @@ def advantage(
     other = loss._run("student_qvalue_network", states, key, target, given)
     error = (value - other) - (target - taught.get(key))
     return (error.squeeze(-1) / loss.advantage_scale[:, None]).square()
+
+
+def reads_sets(encoder: TensorDictModule) -> bool:
+    """Whether an encoder of m reads sets of transitions, under ``"context"``."""
+    return any(isinstance(key, tuple) and key[0] == CONTEXT for key in encoder.in_keys)
+
+
+def check_options(
+    loss: MetaDistillationLoss, isometry_weight: float, arranging: Sequence[float]
+) -> None:
+    """Checks that the options fit the number of tasks and what the encoder reads.
+
+    Args:
+        loss: the loss.
+        isometry_weight: of the isometry term.
+        arranging: weights of the terms that compare tasks.
+
+    Raises:
+        BMRLError: naming the option.
+    """
+    if any(arranging) and loss.num_tasks < 2:
+        raise BMRLError(
+            "metric_weight, distance_weight and contrastive_weight need at least two tasks"
+        )
+    if not loss.reads_sets:
+        if loss.context == "given":
+            raise BMRLError("context is given; valid with an encoder of sets of transitions alone")
+        return
+    wrong = {
+        "context": (loss.context, loss.context in ("set", "given"), "set or given"),
+        "context_fraction": (loss.context_fraction, loss.context_fraction == 1, "1"),
+        "isometry_weight": (isometry_weight, not isometry_weight, "0"),
+    }
+    for name, (value, fits, valid) in wrong.items():
+        if not fits:
+            raise BMRLError(
+                f"{name} is {value}, and the encoder reads sets of transitions; valid: {valid}"
+            )
+
+
+def classify(
+    loss: MetaDistillationLoss, latent: Tensor, task: Tensor, valid: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Cross-entropy of each row's class, ``(num_tasks, B)``, and the accuracy, ``()``."""
+    keys = loss.tensor_keys
+    like = latent.new_empty(*task.shape, loss.num_tasks)
+    data = TensorDict({keys.task_latent: latent}, batch_size=task.shape)
+    logits = loss._run("task_classifier", data, keys.task_logits, like=like)
+    flat = F.cross_entropy(logits.flatten(0, 1), task.flatten().long(), reduction="none")
+    right = (logits.argmax(-1) == task).to(logits.dtype)
+    return flat.view_as(task), functional.average(right, valid)
+
+
+def encoded_keys(loss: MetaDistillationLoss) -> list[NestedKey]:
+    """Keys of the data that m is computed from."""
+    keys = list(loss.task_encoder.in_keys)
+    if not loss.reads_sets:
+        previous = [unravel_key((loss.tensor_keys.previous, key)) for key in keys]
+        return keys + previous * (loss.context == "previous")
+    inner = [unravel_key(key[1:]) for key in keys if key[0] == CONTEXT and key[1:] != ("mask",)]
+    return [unravel_key((CONTEXT, key)) for key in inner] if loss.context == "given" else inner
+
+
+def encode_previous(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> Tensor:
+    """m of the transition before each row's.
+
+    Raises:
+        BMRLError: for data without ``"previous"``.
+    """
+    name = loss.tensor_keys.previous
+    if tensordict.get(name, None) is None:
+        raise BMRLError(
+            f"the data have no {name!r}, which context='previous' reads; valid: data of "
+            "torchrl_bmrl.data.with_previous, or the context current, random or set"
+        )
+    return loss._encode(tensordict, under=name)
+
+
+def embed_rows(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+    """m of each row from single transitions, ``(num_tasks, B, m)``, twice."""
+    latent = loss._encode(tensordict)
+    if loss.context == "current":
+        return latent, latent
+    if loss.context == "previous":
+        other = encode_previous(loss, tensordict)
+    else:
+        # The other rows of a task are draws from its data, and so are its context.
+        size = loss.context_size if loss.context == "set" else 1
+        other = draw_rows(latent, loss.valid_rows(tensordict, latent.shape[:2]), size).mean(2)
+    chosen = torch.rand(latent.shape[:2], device=latent.device) < loss.context_fraction
+    latent = torch.where(chosen.unsqueeze(-1), other, latent)
+    return latent, latent
+
+
+def embed_sets(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+    """m of each row from a random set of its task, ``(num_tasks, B, m)``, and m of the sets.
+
+    The sets are groups of the batch's own rows, and a row is not in its set; or groups of the rows
+    under ``"context"``, which may be of another behaviour.
+    """
+    given = loss.context == "given"
+    batch = tensordict.batch_size
+    valid = loss.valid_rows(tensordict, batch)
+    inner = [unravel_key(key[1:]) for key in loss.task_encoder.in_keys if key[1:] != ("mask",)]
+    rows = loss._entries(tensordict, inner, under=CONTEXT if given else ())
+    contexts, own = group_rows(rows, loss.context_size, valid)
+    points = loss._run("task_encoder", contexts, loss.tensor_keys.task_latent)
+    return assign(points, own, apart=not given), points
+
+
+def arranging_errors(
+    loss: MetaDistillationLoss, points: Tensor, tensordict: TensorDictBase
+) -> dict[str, Tensor]:
+    """Errors that pull embeddings of a task together and push those of different tasks apart.
+
+    Args:
+        loss: the loss.
+        points: embeddings, ``(num_tasks, n, m)``.
+        tensordict: the data, ``[num_tasks, B]``.
+
+    Returns:
+        for each term with a weight ``(num_tasks, B)``; of sets each row has their mean.
+    """
+    weights = (loss.metric_weight, loss.distance_weight, loss.contrastive_weight)
+    if all(weight is None for weight in weights):
+        return {}
+    valid = None if loss.reads_sets else loss.valid_rows(tensordict, tensordict.batch_size)
+    near, far = draw_others(points, valid)
+    errors = {}
+    if loss.metric_weight is not None:
+        errors["metric"] = functional.triplet_error(points, near, far, loss.metric_margin)
+    if loss.distance_weight is not None:
+        errors["distance"] = distance_error(points, near, far)
+    if loss.contrastive_weight is not None:
+        errors["contrastive"] = contrastive_error(points, near, loss.temperature)
+    if not loss.reads_sets:
+        return errors
+    batch = tensordict.batch_size
+    return {term: error.mean(1, keepdim=True).expand(batch) for term, error in errors.items()}

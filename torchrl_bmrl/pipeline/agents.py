@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.transforms import Transform
 
@@ -22,16 +22,21 @@ from torchrl_bmrl.modules import (
     ActionMixture,
     ActionVAE,
     BCQPolicy,
+    ContextTaskLatent,
     DemonstrationTaskLatent,
     OnlineTaskLatent,
     PrototypeTaskLatent,
+    embed_context,
+    make_context_encoder,
     make_decoder,
     make_one_hot_encoder,
     make_perturbation_network,
     make_qvalue_network,
     make_task_classifier,
     make_task_encoder,
+    make_told_encoder,
     prototype,
+    reads_context,
 )
 from torchrl_bmrl.objectives import BCQLoss, MetaDistillationLoss
 from torchrl_bmrl.training.checkpoint import build, load_checkpoint
@@ -135,8 +140,11 @@ class Student(nn.Module):
         num_tasks: number of teachers.
         observation_dim: size of the observation.
         action_dim: size of the action.
-        task_encoder: ``"transition"``, or ``"one_hot"``: m is the task's index, one-hot.
-        task_latent_dim: size of m if it is not one-hot.
+        task_encoder: ``"transition"``; ``"set_mean"`` or ``"set_attention"``: m of a set of
+            transitions; ``"one_hot"``: m is the task's index, one-hot; ``"told"``: m is given by
+            ``codes``.
+        task_latent_dim: size of m, except for the last two.
+        codes: numbers that the policy is told about each task, ``(num_tasks, n)``.
         num_cells: widths of the hidden layers.
         latent_dim: size of the teachers' ``action_latent``; by default twice the action's.
 
@@ -166,6 +174,7 @@ class Student(nn.Module):
         task_latent_dim: int = 2,
         num_cells: Sequence[int] = (256, 256),
         latent_dim: int | None = None,
+        codes: Sequence[Sequence[float]] | None = None,
     ) -> None:
         super().__init__()
         dims = (observation_dim, action_dim)
@@ -175,6 +184,17 @@ class Student(nn.Module):
         if task_encoder == "one_hot":
             task_latent_dim = num_tasks
             self.task_encoder = make_one_hot_encoder(num_tasks)
+        elif task_encoder == "told":
+            table = torch.tensor(codes, dtype=torch.get_default_dtype())
+            task_latent_dim = table.shape[-1]
+            self.task_encoder = make_told_encoder(table)
+        elif task_encoder in OF_SETS:
+            self.task_encoder = make_context_encoder(
+                *dims,
+                task_latent_dim,
+                pooling=task_encoder.removeprefix("set_"),
+                num_cells=num_cells,
+            )
         else:
             self.task_encoder = make_task_encoder(*dims, task_latent_dim, num_cells=num_cells)
         self.task_classifier = make_task_classifier(num_tasks, task_latent_dim)
@@ -195,6 +215,19 @@ class Student(nn.Module):
         """
         return self.task_encoder(data.select(*self.task_encoder.in_keys)).get("task_latent")
 
+    def embed_context(self, context: TensorDictBase) -> Tensor:
+        """Returns the embedding m of a set of transitions of one task, ``(*B, task_latent_dim)``.
+
+        The task need not be one of those that the student was trained on.
+
+        Args:
+            context: normalised transitions, batch ``[*B, K]``.
+
+        Raises:
+            BMRLError: as :func:`~torchrl_bmrl.modules.embed_context`.
+        """
+        return embed_context(self.task_encoder, context)
+
     @torch.no_grad()
     def set_prototypes(self, datasets: Sequence[TensorDictBase], kind: str) -> None:
         """Computes each task's prototype from its training data.
@@ -206,19 +239,28 @@ class Student(nn.Module):
         Raises:
             BMRLError: for another kind, or a task without data.
         """
-        points = [prototype(self.embed(data), kind) for data in datasets]
+        if reads_context(self.task_encoder):
+            points = [self.embed_context(data) for data in datasets]
+        else:
+            points = [prototype(self.embed(data), kind) for data in datasets]
         self.prototypes.copy_(torch.stack(points))
 
     @torch.no_grad()
     def accuracy(self, data: TensorDictBase) -> float:
-        """Returns the classifier's accuracy, in [0, 1].
+        """Returns the classifier's accuracy, in [0, 1]; with an encoder of sets over whole tasks.
 
         Args:
-            data: batch ``[*B]`` with the encoder's inputs and the class index ``task (*B,)``.
+            data: batch ``[N]`` with the encoder's inputs and the class index ``task (N,)``.
         """
-        encoded = self.task_encoder(data.select(*self.task_encoder.in_keys))
+        task = data.get("task")
+        if reads_context(self.task_encoder):
+            task = task.unique()
+            latent = torch.stack([self.embed_context(data[data.get("task") == i]) for i in task])
+        else:
+            latent = self.embed(data)
+        encoded = TensorDict({"task_latent": latent}, batch_size=task.shape)
         logits = self.task_classifier(encoded).get("task_logits")
-        return (logits.argmax(-1) == data.get("task")).float().mean().item()
+        return (logits.argmax(-1) == task).float().mean().item()
 
     def policy(self, *, num_candidates: int, latent_clip: float | None) -> BCQPolicy:
         """Returns the distilled policy, which reads ``task_latent`` and shares the networks.
@@ -244,7 +286,8 @@ class Student(nn.Module):
         """Returns the transform that writes ``task_latent`` while the policy acts.
 
         Args:
-            source: ``"prototype"``, ``"online"`` or ``"demonstration"``.
+            source: ``"prototype"``, ``"online"`` or ``"demonstration"``. With an encoder of sets
+                the context grows online, and a demonstration is one context.
             task: class index.
             demonstration: transitions of one episode, batch ``[T]``, for the last source.
 
@@ -254,21 +297,27 @@ class Student(nn.Module):
         """
         if source == "prototype":
             return PrototypeTaskLatent(self.prototypes[task])
+        sets = reads_context(self.task_encoder)
         if source == "online":
-            return OnlineTaskLatent(self.prototypes[task], self.task_encoder)
+            kind = ContextTaskLatent if sets else OnlineTaskLatent
+            return kind(self.prototypes[task], self.task_encoder)
         if source == "demonstration":
+            if sets:
+                assert demonstration is not None
+                return PrototypeTaskLatent(self.embed_context(demonstration))
             return DemonstrationTaskLatent(demonstration, self.task_encoder)
         raise UnknownNameError("latent source", source, LATENT_SOURCES)
 
 
 def make_distillation_loss(
-    student: Student, teachers: Sequence[BCQPolicy], **options: Any
+    student: Student, teachers: Sequence[BCQPolicy], *, classifies: bool = True, **options: Any
 ) -> MetaDistillationLoss:
     """Returns the loss that distils teachers, one per task, into a student without copying it.
 
     Args:
         student: student for as many tasks as there are teachers.
         teachers: trained agents, for example from :meth:`BCQPolicy.frozen`.
+        classifies: whether the student's classifier is trained, too.
         **options: options of :class:`MetaDistillationLoss` except those of the latent.
 
     Raises:
@@ -282,7 +331,7 @@ def make_distillation_loss(
     """
     return MetaDistillationLoss(
         student.task_encoder,
-        student.task_classifier,
+        student.task_classifier if classifies else None,
         student.generator,
         student.qvalue_network,
         [teacher.generator for teacher in teachers],
@@ -294,7 +343,8 @@ def make_distillation_loss(
 
 
 LATENT_SOURCES = ("prototype", "online", "demonstration")
-TASK_ENCODERS = ("transition", "one_hot")
+OF_SETS = ("set_mean", "set_attention")
+TASK_ENCODERS = ("transition", *OF_SETS, "one_hot", "told")
 
 
 def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
