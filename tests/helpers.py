@@ -31,6 +31,7 @@ from torchrl_bmrl.modules import (
     make_latent_actor,
     make_perturbation_network,
     make_qvalue_network,
+    make_reward_models,
     make_task_classifier,
     make_task_encoder,
 )
@@ -40,8 +41,10 @@ from torchrl_bmrl.objectives import (
     DiscreteBCQLoss,
     FOCALLoss,
     FQELoss,
+    MBMLLoss,
     MetaDistillationLoss,
     PLASLoss,
+    RewardModelLoss,
     StackedLoss,
 )
 from torchrl_bmrl.testing import Case, discrete_transitions, transitions
@@ -304,6 +307,51 @@ def focal_case(**options: Any) -> Case:
 def make_focal_loss(**options: Any) -> FOCALLoss:
     """A small loss whose target networks differ from the trained ones."""
     return focal_case().make(**options)
+
+
+def reward_models_case() -> Case:
+    def networks() -> dict[str, Any]:
+        return {"reward_models": make_reward_models(TASKS, *DIMS, num_models=4, num_cells=CELLS)}
+
+    trains = {"reward": {"reward_models"}}
+    return Case(RewardModelLoss, networks, trains, data=task_transitions, shape=(TASKS, ROWS))
+
+
+def mbml_networks() -> dict[str, Any]:
+    networks = distillation_networks() | reward_models_case().networks()
+    del networks["task_classifier"]
+    sizes = {"num_features": 4, "num_cells": CELLS}
+    return networks | {M: make_context_encoder(*DIMS, TASK_LATENT_DIM, **sizes)}
+
+
+def mbml_case(**options: Any) -> Case:
+    return Case(
+        MBMLLoss,
+        mbml_networks,
+        {
+            "generator": {G},
+            "direction": {G},
+            "qvalue": {M, "student_qvalue_network"},
+            "latent_norm": {M},
+            "triplet": {M},
+        },
+        options={
+            "latent_dim": LATENT_DIM,
+            "context_size": 2,
+            "max_deviation": 10.0,
+            "direction_weight": 1.0,
+            **options,
+        },
+        data=task_transitions,
+        shape=(TASKS, ROWS),
+        need_not_fall=("latent_norm", "triplet"),
+        mixes_rows=True,
+    )
+
+
+def make_mbml_loss(**options: Any) -> MBMLLoss:
+    """A small loss with teachers of its own and untrained reward models."""
+    return mbml_case().make(**options)
 
 
 def guide(name: str = "extending") -> ModuleType:

@@ -28,7 +28,9 @@ from helpers import (
     focal_case,
     fqe_case,
     guide,
+    mbml_case,
     plas_case,
+    reward_models_case,
 )
 from tensordict import TensorDict
 from torchrl.data import Bounded, Unbounded
@@ -65,9 +67,11 @@ STUDENTS = {
         STUDENT | {"metric": {M}}, context="set", metric_weight=0.5
     ),
 }
-CASES = OFFLINE | STUDENTS
+RELABELLING = {"mbml": mbml_case(), "reward_models": reward_models_case()}
+CASES = OFFLINE | STUDENTS | RELABELLING
 every = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 every_offline = pytest.mark.parametrize("case", OFFLINE.values(), ids=OFFLINE)
+every_relabelling = pytest.mark.parametrize("case", RELABELLING.values(), ids=RELABELLING)
 every_student = pytest.mark.parametrize("case", STUDENTS.values(), ids=STUDENTS)
 
 
@@ -109,6 +113,11 @@ class TestStudents(KeyedLossContract):
         data = case.batch()
         data[key] = torch.zeros(shape, dtype=data[key].dtype)
         refused(case.make(), data, repr(key), str(shape), "valid")
+
+
+@every_relabelling
+class TestRelabellingLosses(KeyedLossContract):
+    """What holds for a loss without critics of its own."""
 
 
 def test_every_loss_of_the_library_has_a_case() -> None:
@@ -176,6 +185,8 @@ BAD_OPTIONS = [
     (["focal"], {"entropy_weight": -1.0}, "entropy_weight is -1.0; valid: at least 0"),
     (["discrete_bcq"], {"threshold": 1.5}, "threshold is 1.5; valid: between 0 and 1"),
     (["discrete_bcq"], {"action_space": "box"}, "'box'; valid .*: one-hot, categorical"),
+    (["mbml"], {"max_deviation": -0.1}, "max_deviation is -0.1; valid: at least 0"),
+    (["mbml"], {"triplet_margin": -1.0}, "triplet_margin is -1.0; valid: at least 0"),
     (STUDENTS, {"context": "next"}, "'next'; valid .*: current, previous, random, set"),
     (STUDENTS, {"context_fraction": 1.5}, "context_fraction is 1.5; valid: between 0 and 1"),
     (STUDENTS, {"context_size": 0}, "context_size is 0; valid: at least 1"),

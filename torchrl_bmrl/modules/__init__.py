@@ -25,6 +25,7 @@ from torchrl_bmrl.modules.generator import (
 from torchrl_bmrl.modules.latent_action import HeldTaskLatent, task_latent_box
 from torchrl_bmrl.modules.mixture import ActionMixture
 from torchrl_bmrl.modules.policy import BCQPolicy, PLASPolicy
+from torchrl_bmrl.modules.reward_models import make_reward_models
 from torchrl_bmrl.modules.task_latent import (
     OnlineTaskLatent,
     PathTaskLatent,
@@ -64,6 +65,7 @@ __all__ = [
     "make_one_hot_encoder",
     "make_perturbation_network",
     "make_qvalue_network",
+    "make_reward_models",
     "make_task_classifier",
     "make_task_encoder",
     "make_told_encoder",

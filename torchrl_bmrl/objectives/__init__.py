@@ -8,8 +8,10 @@ from torchrl_bmrl.objectives.distillation import MetaDistillationLoss
 from torchrl_bmrl.objectives.focal import FOCALLoss
 from torchrl_bmrl.objectives.fqe import FQELoss
 from torchrl_bmrl.objectives.generative import GenerativeLoss
+from torchrl_bmrl.objectives.mbml import MBMLLoss
 from torchrl_bmrl.objectives.plas import PLASLoss
 from torchrl_bmrl.objectives.rebrac import ReBRACLoss
+from torchrl_bmrl.objectives.relabel import RewardModelLoss
 from torchrl_bmrl.objectives.stacked import StackedLoss
 
 __all__ = [
@@ -19,9 +21,11 @@ __all__ = [
     "FQELoss",
     "GenerativeLoss",
     "KeyedLoss",
+    "MBMLLoss",
     "MetaDistillationLoss",
     "OfflineLoss",
     "PLASLoss",
     "ReBRACLoss",
+    "RewardModelLoss",
     "StackedLoss",
 ]

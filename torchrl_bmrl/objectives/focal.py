@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from tensordict import TensorDictBase, TensorDictParams, unravel_key
+from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -20,7 +20,8 @@ from torchrl_bmrl.functional import average
 from torchrl_bmrl.generators import written
 from torchrl_bmrl.objectives.checks import check_network, check_number
 from torchrl_bmrl.objectives.common import OfflineLoss
-from torchrl_bmrl.objectives.contexts import CONTEXT, assign, group_rows
+from torchrl_bmrl.objectives.context_rows import context_keys, encode_contexts
+from torchrl_bmrl.objectives.contexts import assign, group_rows
 from torchrl_bmrl.objectives.data import check_within, entry, next_key
 from torchrl_bmrl.objectives.estimators import outcomes
 from torchrl_bmrl.objectives.generative import action_bounds
@@ -201,11 +202,6 @@ class FOCALLoss(OfflineLoss):
             check_network(name, network)
             self.check_sizes(name, network)
             self.convert_to_functional(network, name, create_target_params=False)
-        if self._mask_key not in task_encoder.in_keys:
-            raise BMRLError(
-                f"task_encoder reads {list(task_encoder.in_keys)}; valid: an encoder of sets, such "
-                "as torchrl_bmrl.modules.make_context_encoder"
-            )
         self.register_coefficients(high=max_divergence_weight, divergence_weight=divergence_weight)
         self.register_coefficients(
             entropy_weight=entropy_weight, actor_norm_weight=actor_norm_weight
@@ -217,14 +213,6 @@ class FOCALLoss(OfflineLoss):
         self.finish()
 
     # -- keys ------------------------------------------------------------------------------------
-
-    _mask_key = (CONTEXT, "mask")
-
-    @property
-    def context_keys(self) -> list[NestedKey]:
-        """Keys of a transition that the encoder reads, now and under ``"next"``."""
-        keys = [key for key in self.task_encoder.in_keys if key != self._mask_key]
-        return [unravel_key(key[1:]) for key in keys]
 
     @property
     def observation_keys(self) -> list[NestedKey]:
@@ -238,7 +226,7 @@ class FOCALLoss(OfflineLoss):
         """The contexts' transitions, the observation now and after the step, and the outcome."""
         now = [*self.observation_keys, self.tensor_keys.action]
         after = map(next_key, self.observation_keys)
-        return [*self.context_keys, *now, *after, *self.outcome_keys]
+        return [*context_keys(self.task_encoder), *now, *after, *self.outcome_keys]
 
     # -- the embedding ---------------------------------------------------------------------------
 
@@ -261,17 +249,9 @@ class FOCALLoss(OfflineLoss):
             )
         valid = self.valid_rows(tensordict, batch)
         outcomes(tensordict, self.tensor_keys, valid, torch.Size([*batch, 1]))
-        rows = self.rows(tensordict, self.context_keys)
+        rows = self.rows(tensordict, context_keys(self.task_encoder))
         contexts, own = group_rows(rows, self.context_size, valid)
-        try:
-            points = self.call("task_encoder", contexts)
-        except BMRLError as error:
-            shapes = ", ".join(f"{key!r} {tuple(rows.get(key).shape)}" for key in self.context_keys)
-            raise BMRLError(
-                f"task_encoder cannot read contexts of {shapes}; valid: the sizes that it was made "
-                f"for ({error})"
-            ) from error
-        points = written(points, self.tensor_keys.task_latent, self.task_encoder)
+        points = encode_contexts(self, contexts, rows)
         return assign(points, own, apart=True), points
 
     @torch.no_grad()
