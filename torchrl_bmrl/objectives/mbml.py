@@ -51,8 +51,10 @@ class MBMLLoss(MetaDistillationLoss):
     Gaussians of unit variance a divergence is half the squared distance; a margin of 2 is the same
     number in both), and a penalty on m replaces the divergence from the prior. One other task is
     drawn for each task, not all. The critic is distilled at the student's action for a latent, not
-    at the data's action, and normalised. Perturbation networks are not distilled. Rewards alone are
-    relabelled, not next observations (published for Walker only).
+    at the data's action, and normalised: published values are not, and outweigh the triplet's term.
+    So try weights below the published 1, such as 0.1, if the actions do not follow m. Perturbation
+    networks are not distilled. Rewards alone are relabelled, not next observations (published for
+    Walker only).
 
     Args:
         task_encoder: M, of sets that contain the reward (``make_context_encoder``).
@@ -65,6 +67,7 @@ class MBMLLoss(MetaDistillationLoss):
         max_deviation: largest standard deviation of a relabelled reward that counts, as a share of
             ``reward_scale``; published: 0.02 to 0.2 for rewards that are not scaled.
         context_size: largest number of own transitions in a context, and of relabelled ones.
+        direction_weight: w_d of ``MetaDistillationLoss``, which the publication has not.
         encoder_terms: other terms whose gradient reaches M.
         **options: of ``MetaDistillationLoss``.
 
@@ -251,8 +254,8 @@ class MBMLLoss(MetaDistillationLoss):
         known = mask.any(-1)
         mask = mask | ~known.unsqueeze(-1)  # an empty context must not be pooled
         parts = [anchor.copy().set("mask", mask), positive, negative.copy().set("mask", mask)]
-        points = self._points(torch.cat(parts, 1), rows).chunk(3, 1)
-        error = functional.triplet_error(*points, self.triplet_margin)
+        points, near, far = self._points(torch.cat(parts, 1), rows).chunk(3, 1)
+        error = functional.triplet_error(points, near, far, self.triplet_margin)
         error = torch.where(known, error, 0.0).sum(-1) / known.sum(-1).clamp(min=1)
         return error.unsqueeze(-1).expand(tensordict.batch_size)
 
