@@ -74,6 +74,7 @@ _NEEDS = {
         "tests/weak_data.py",
         "torchrl_bmrl/reports/*",
     ],
+    "metaworld": ["torchrl_bmrl/envs/metaworld.py", "torchrl_bmrl/experts/metaworld.py"],
     "minari": ["tests/minari_files.py", "torchrl_bmrl/data/convert.py"],
     "mujoco": ["torchrl_bmrl/reports/films.py"],
     "onnxscript": ["torchrl_bmrl/export.py"],
@@ -86,7 +87,11 @@ _NEEDS = {
         "torchrl_bmrl/evaluation/rollout.py",
         "torchrl_bmrl/experts/*",
     ],
-    "safetensors": ["torchrl_bmrl/pipeline/agents.py", "torchrl_bmrl/training/checkpoint.py"],
+    "safetensors": [
+        "torchrl_bmrl/pipeline/agents.py",
+        "torchrl_bmrl/pipeline/student.py",
+        "torchrl_bmrl/training/checkpoint.py",
+    ],
     "scipy": [
         "tests/explorers.py",
         "tests/report_data.py",

@@ -19,7 +19,7 @@ from PIL import Image
 from tensordict import TensorDict
 
 from torchrl_bmrl.envs.rendering import render_states
-from torchrl_bmrl.pipeline.agents import load_student
+from torchrl_bmrl.pipeline.student import load_student
 from torchrl_bmrl.reports import embedding_scatter, task_colors, task_name
 from torchrl_bmrl.tasks import get_task
 from torchrl_bmrl.training.checkpoint import load_checkpoint

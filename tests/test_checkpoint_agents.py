@@ -15,7 +15,8 @@ pytest.importorskip("safetensors")
 
 from torchrl_bmrl.errors import CheckpointError
 from torchrl_bmrl.modules import BCQPolicy
-from torchrl_bmrl.pipeline.agents import Student, load_bcq_loss, load_student, make_bcq_loss
+from torchrl_bmrl.pipeline.agents import load_bcq_loss, make_bcq_loss
+from torchrl_bmrl.pipeline.student import Student, load_student
 from torchrl_bmrl.training.checkpoint import save_checkpoint
 
 SMALL = {"num_cells": [8], "observation_dim": 3, "action_dim": 2}

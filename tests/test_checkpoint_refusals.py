@@ -17,7 +17,8 @@ from torch import nn
 pytest.importorskip("safetensors")
 
 from torchrl_bmrl.errors import CheckpointError
-from torchrl_bmrl.pipeline.agents import load_bcq_loss, load_student
+from torchrl_bmrl.pipeline.agents import load_bcq_loss
+from torchrl_bmrl.pipeline.student import load_student
 from torchrl_bmrl.training.checkpoint import load_checkpoint, load_state, save_checkpoint
 
 path = pytest.fixture(checkpoint_path)

@@ -37,9 +37,9 @@ def test_the_policy_of_the_repository_plays_all_tasks_and_knows_its_own_demonstr
     run: Run, tmp_path: Path
 ) -> None:
     from torchrl_bmrl.pipeline import evaluate
-    from torchrl_bmrl.pipeline.agents import load_student
     from torchrl_bmrl.pipeline.evaluate import held_out_episode
     from torchrl_bmrl.pipeline.settings import SIX_TASKS
+    from torchrl_bmrl.pipeline.student import load_student
 
     policy = RECIPES / "policies" / "sawyer.safetensors"
     assert policy.stat().st_size < 5e6
@@ -73,7 +73,7 @@ def test_an_exported_policy_acts_alone_as_it_does_in_its_run(
     from torchrl_bmrl.data.demonstrations import read_statistics
     from torchrl_bmrl.envs.transforms import ObservationStatistics
     from torchrl_bmrl.pipeline import evaluate
-    from torchrl_bmrl.pipeline.agents import load_student
+    from torchrl_bmrl.pipeline.student import load_student
 
     policy = shutil.copy(exported / "policy.safetensors", tmp_path)
     kept = ObservationStatistics.from_lists(load_student(Path(policy))[1]["statistics"])
@@ -113,7 +113,7 @@ def check_onnx(path: Path, policy: Path) -> None:
     """Compares the file's actions on the policy's own demonstrations, and their values, with it."""
     onnxruntime = pytest.importorskip("onnxruntime")
     from torchrl_bmrl.functional import sample_action_latent
-    from torchrl_bmrl.pipeline.agents import load_student
+    from torchrl_bmrl.pipeline.student import load_student
     from torchrl_bmrl.training.checkpoint import load_checkpoint
 
     student, metadata = load_student(policy)

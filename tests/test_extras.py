@@ -24,6 +24,7 @@ RECIPES = ROOT / "recipes"
 HIDDEN = {
     "robosuite": ["gymnasium", "llvmlite", "mujoco", "numba", "robosuite"],
     "data": ["h5py", "minari", "pyarrow", "tqdm"],
+    "metaworld": ["gymnasium", "metaworld"],
     "recipes": ["filelock", "hydra", "omegaconf", "onnx", "onnxscript", "safetensors", "yaml"],
     "reports": ["PIL", "jinja2", "matplotlib", "scipy", "sklearn", "threadpoolctl"],
     "everything": ["pytest", "tensorboard", "wandb"],
@@ -181,7 +182,14 @@ def test_the_core_imports_with_everything_hidden_and_the_rest_does_not(told: Any
     failed = told("everything")
     core = ("objectives", "modules", "data", "data.replay", "data.episodes", "functional")
     assert not {f"torchrl_bmrl.{name}" for name in core} & failed.keys()
-    rest = ("pipeline.agents", "training.checkpoint", "configs", "data.hdf5", "envs.tabletop")
+    rest = (
+        "pipeline.agents",
+        "pipeline.student",
+        "training.checkpoint",
+        "configs",
+        "data.hdf5",
+        "envs.tabletop",
+    )
     assert {f"torchrl_bmrl.{name}" for name in (*rest, "reports", "run.folder")} <= failed.keys()
 
 

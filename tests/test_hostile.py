@@ -41,14 +41,9 @@ from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.pipeline import Run, learners
-from torchrl_bmrl.pipeline.agents import (
-    Student,
-    load_bcq_loss,
-    load_student,
-    make_bcq_loss,
-    make_distillation_loss,
-)
+from torchrl_bmrl.pipeline.agents import load_bcq_loss, make_bcq_loss
 from torchrl_bmrl.pipeline.stage2 import OF_THE_STUDENT, loss_options
+from torchrl_bmrl.pipeline.student import Student, load_student, make_distillation_loss
 from torchrl_bmrl.run.folder import deciding, open_run, read_settings, read_versions
 from torchrl_bmrl.tasks import Task, get_task
 from torchrl_bmrl.training import checkpoint, make_adam

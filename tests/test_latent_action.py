@@ -173,7 +173,7 @@ def test_embeddings_that_span_no_box_are_refused(points: torch.Tensor) -> None:
 @pytest.mark.parametrize("size", [2, 3])
 def test_a_student_acts_with_m_of_its_own_size(size: int) -> None:
     pytest.importorskip("safetensors")
-    from torchrl_bmrl.pipeline.agents import Student
+    from torchrl_bmrl.pipeline.student import Student
 
     student = Student(
         num_tasks=2, task_latent_dim=size, num_cells=(8,), observation_dim=1, action_dim=3

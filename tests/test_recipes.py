@@ -97,7 +97,7 @@ def test_a_one_hot_student_learns_from_the_same_agents_and_acts(
     run: Run, finished: Path, tmp_path: Path
 ) -> None:
     from torchrl_bmrl.pipeline import two_stage
-    from torchrl_bmrl.pipeline.agents import load_student
+    from torchrl_bmrl.pipeline.student import load_student
 
     folder = run(
         tmp_path / "run",

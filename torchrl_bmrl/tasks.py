@@ -18,12 +18,17 @@ from typing import TYPE_CHECKING, Any
 from torchrl_bmrl.errors import ConfigError, UnknownNameError
 
 if TYPE_CHECKING:
+    from torch import Tensor
     from torchrl.envs import EnvBase
     from torchrl.envs.transforms import Transform
 
     from torchrl_bmrl.data.episodes import Episode
 
-OWN_TASKS = ("torchrl_bmrl.experts.tabletop", "torchrl_bmrl.experts.sawyer_families")
+OWN_TASKS = (
+    "torchrl_bmrl.experts.tabletop",
+    "torchrl_bmrl.experts.sawyer_families",
+    "torchrl_bmrl.experts.metaworld",
+)
 """Modules that register this package's own tasks; they are imported when a name is looked up."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.]*")
 
@@ -146,6 +151,9 @@ class Family:
             names.
         code: ``code(*parameter)`` returns the numbers that a policy is given which is told the
             parameter; ``None``: the parameter, scaled to [-1, 1] over the trained members.
+        period: after which a parameter repeats, such as 360 for a direction; ``None``: never.
+        measure: returns the parameter that an episode looks like, from its observations
+            ``(T, obs_dim)``, not normalised; ``None``: the family has no such measure.
         title: name in tables and figures; by default the name with spaces for underscores.
 
     Raises:
@@ -166,6 +174,8 @@ class Family:
     members: Mapping[str, Sequence[tuple[float, ...]]]
     make: Callable[..., Task]
     code: Callable[..., tuple[float, ...]] | None = None
+    period: float | None = None
+    measure: Callable[[Tensor], tuple[float, ...]] | None = None
     title: str = ""
 
     def __post_init__(self) -> None:

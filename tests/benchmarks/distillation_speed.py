@@ -21,7 +21,8 @@ from bcq_speed import ACTION_DIM, LR, OBSERVATION_DIM, make_batch, read_options,
 from tensordict import TensorDict
 
 from torchrl_bmrl.modules import BCQPolicy
-from torchrl_bmrl.pipeline.agents import Student, make_bcq_loss, make_distillation_loss
+from torchrl_bmrl.pipeline.agents import make_bcq_loss
+from torchrl_bmrl.pipeline.student import Student, make_distillation_loss
 from torchrl_bmrl.training import accelerate, gradient_step, keep_freed_memory, make_adam
 
 TASKS, ROWS = 6, 64

@@ -29,7 +29,7 @@ from tensordict import TensorDict
 
 from torchrl_bmrl.export import export_policy
 from torchrl_bmrl.modules import BCQPolicy
-from torchrl_bmrl.pipeline.agents import Student
+from torchrl_bmrl.pipeline.student import Student
 from torchrl_bmrl.training import keep_freed_memory
 
 CANDIDATES = 100

@@ -34,7 +34,8 @@ from torch import Tensor
 
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.objectives import BCQLoss
-from torchrl_bmrl.pipeline.agents import GENERATORS, Student, make_bcq_loss
+from torchrl_bmrl.pipeline.agents import GENERATORS, make_bcq_loss
+from torchrl_bmrl.pipeline.student import Student
 from torchrl_bmrl.training import keep_freed_memory
 
 BATCH_SIZES, CRITICS, TARGET_CANDIDATES = (128, 256), (2, 4), (4, 10)

@@ -29,7 +29,7 @@ from tensordict import TensorDict
 from torchrl_bmrl.data import make_multi_task_replay_buffer, make_replay_buffer
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.objectives import MetaDistillationLoss
-from torchrl_bmrl.pipeline.agents import Student
+from torchrl_bmrl.pipeline.student import Student
 
 HORIZON = 200
 WARM_UP = 5

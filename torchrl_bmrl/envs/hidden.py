@@ -258,3 +258,10 @@ HIDDEN: dict[str, type[_Hidden]] = {
     kind.stem: kind for kind in (PushTowards, ReachHidden, LiftToHeight, ReachAtSpeed)
 }
 """The classes by the name of their family."""
+HIDDEN_HORIZONS = {
+    "push_towards": 100,
+    "reach_hidden": 100,
+    "lift_to_height": 100,
+    "reach_at_speed": 200,
+}
+"""Steps of an episode by the name of the family: little more than the slowest member needs."""

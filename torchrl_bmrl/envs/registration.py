@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
-from torchrl_bmrl.envs.hidden import HIDDEN
+from torchrl_bmrl.envs.hidden import HIDDEN, HIDDEN_HORIZONS
 from torchrl_bmrl.envs.skills import SKILLS, make_skills
 from torchrl_bmrl.extras import needs
 
@@ -100,6 +100,6 @@ def register() -> None:
                 gymnasium_id(family),
                 entry_point="torchrl_bmrl.envs.registration:make_member",
                 vector_entry_point="torchrl_bmrl.envs.registration:make_member",
-                kwargs={"family": family, "horizon": 200, **parameter},
+                kwargs={"family": family, "horizon": HIDDEN_HORIZONS[family], **parameter},
                 disable_env_checker=True,
             )

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import (
     count_episodes,
@@ -31,6 +33,7 @@ class _EpisodeJob:
     path: Path
     expert: ExpertSettings
     after: tuple[Task, ...]
+    like: tuple[Task, ...]
 
 
 def _collect_job(job: _EpisodeJob, report: Report) -> None:
@@ -40,6 +43,7 @@ def _collect_job(job: _EpisodeJob, report: Report) -> None:
         noise=job.expert.noise,
         gains=job.expert.gains,
         after=job.after,
+        **({"like": job.like} if job.like else {}),
         **job.task.options,
     )
     keep_episode(job.path, episode)
@@ -52,6 +56,7 @@ def collect_demonstrations(
     episodes: Mapping[str, int],
     *,
     valid_episodes: int,
+    context_episodes: int = 0,
     noise: float,
     seed: int,
     workers: int,
@@ -69,6 +74,8 @@ def collect_demonstrations(
         tasks: tasks with ``record``, recorded in this order.
         episodes: number of training episodes by task name.
         valid_episodes: number of held-out episodes of each task, under ``mask/valid``.
+        context_episodes: number of episodes of each task in which the experts of some other tasks
+            act in turn, under ``mask/context``; no agent is trained to act as in these.
         noise: standard deviation of the Gaussian action noise.
         seed: the seed; it decides every episode.
         workers: number of processes.
@@ -116,7 +123,10 @@ def collect_demonstrations(
     changes = experts or {}
     chosen = {name: experts_of(name, changes, noise=noise, gains=gains) for name in by_name}
     files = {name: directory / f"{name}.hdf5" for name in by_name}
-    counts = {name: episodes[name] + valid_episodes for name in by_name}
+    if context_episodes and len(tasks) < 2:
+        raise ConfigError("context_episodes with one task; valid: at least two tasks, or 0")
+    own = {name: episodes[name] + valid_episodes for name in by_name}
+    counts = {name: number + context_episodes for name, number in own.items()}
     parts = {
         name: [directory / ".episodes" / name / f"{i:05d}.npz" for i in range(counts[name])]
         for name, path in files.items()
@@ -129,6 +139,7 @@ def collect_demonstrations(
             path=path,
             expert=chosen[name][i % len(chosen[name])],
             after=befores[name][i % len(befores[name])],
+            like=() if i < own[name] else others_than(tasks, name, seed=derive_seed(seed, name, i)),
         )
         for name, paths in parts.items()
         for i, path in enumerate(paths)
@@ -149,7 +160,8 @@ def collect_demonstrations(
         first, count = read_kept_episode(paths[0]), len(chosen[name])
         masks = {
             "train": range(episodes[name]),
-            "valid": range(episodes[name], counts[name]),
+            "valid": range(episodes[name], own[name]),
+            **({"context": range(own[name], counts[name])} if context_episodes else {}),
         }
         write_episodes(
             files[name],
@@ -177,6 +189,28 @@ def collect_demonstrations(
                 "run_dir or remove the file",
             )
     return files
+
+
+WANDERING = 4
+"""Experts that act in turn in an episode of another behaviour."""
+
+
+def others_than(tasks: Sequence[Task], name: str, *, seed: int) -> tuple[Task, ...]:
+    """Returns some of the other tasks at random, at most :data:`WANDERING`.
+
+    Args:
+        tasks: the tasks.
+        name: the task to leave out; it may be none of them.
+        seed: of the choice.
+
+    Example:
+        >>> tasks = [get_task(name) for name in ("reach", "lift", "push_up")]
+        >>> sorted(task.name for task in others_than(tasks, "lift", seed=0))
+        ['push_up', 'reach']
+    """
+    others = [task for task in tasks if task.name != name]
+    order = np.random.default_rng(seed).permutation(len(others))[:WANDERING]
+    return tuple(others[i] for i in order)
 
 
 def _parse_after(entry: str, by_name: Mapping[str, Task]) -> tuple[Task, ...]:

@@ -6,16 +6,22 @@ Importing this module registers ``push_towards``, ``reach_hidden``, ``lift_to_he
 
 from __future__ import annotations
 
+import math
 from functools import partial
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from torchrl_bmrl.envs.hidden import (
+    CHECKPOINT,
     HIDDEN,
+    HIDDEN_HORIZONS,
     LiftToHeight,
     PushTowards,
     ReachAtSpeed,
 )
+from torchrl_bmrl.envs.table import CONTROL_FREQUENCY, TABLE_TOP
 from torchrl_bmrl.experts.controllers import (
     EXPERTS,
     Expert,
@@ -82,7 +88,7 @@ class ReachHiddenExpert(ReachExpert):
     """Moves straight to the point, which it knows."""
 
     def _goal(self) -> np.ndarray:
-        return self.env.goal_start
+        return self.skill.begin(self.env, None)
 
 
 class LiftToHeightExpert(LiftExpert):
@@ -125,7 +131,8 @@ def make_member(family: str, *parameter: float) -> Task:
         >>> make_member("push_towards", 45).name
         'push_towards_45'
     """
-    return make_task(HIDDEN[family](*parameter), HIDDEN_EXPERTS[family])
+    skill = HIDDEN[family](*parameter)
+    return make_task(skill, HIDDEN_EXPERTS[family], horizon=HIDDEN_HORIZONS[family])
 
 
 def _points(number: int, low: tuple[int, ...], high: tuple[int, ...]) -> list[tuple[int, ...]]:
@@ -142,7 +149,52 @@ def _circle(direction: float) -> tuple[float, float]:
     return float(np.cos(angle)), float(np.sin(angle))
 
 
-_POINTS = _points(32, (-12, -20, 6), (12, 20, 32))
+def _end_effector(observation: Tensor) -> Tensor:
+    return observation[:, -10:-7]  # OBSERVATION_PARTS ends with it, a quaternion and goal_pos
+
+
+def pushed_direction(observation: Tensor) -> tuple[float]:
+    """Direction from the cube's first to its last position [°].
+
+    Args:
+        observation: of an episode, ``(T, obs_dim)``.
+    """
+    x, y, _ = (observation[-1, -3:] - observation[0, -3:]).tolist()
+    return (math.degrees(math.atan2(y, x)) % 360,)
+
+
+def lifted_height(observation: Tensor) -> tuple[float]:
+    """Height of the cube above its start, mean over the last ten steps [cm].
+
+    Args:
+        observation: of an episode, ``(T, obs_dim)``.
+    """
+    return (100 * float(observation[-10:, -1].mean() - observation[0, -1]),)
+
+
+def reached_point(observation: Tensor) -> tuple[float, ...]:
+    """Last position of the end-effector, relative to the table's centre [cm].
+
+    Args:
+        observation: of an episode, ``(T, obs_dim)``.
+    """
+    centre = torch.as_tensor(TABLE_TOP, dtype=observation.dtype)
+    return tuple((100 * (_end_effector(observation)[-1] - centre)).tolist())
+
+
+def moved_speed(observation: Tensor) -> tuple[float]:
+    """Mean speed of the end-effector over the first three quarters of its way [mm/s].
+
+    Args:
+        observation: of an episode, ``(T, obs_dim)``.
+    """
+    way = (_end_effector(observation) - _end_effector(observation)[0]).norm(dim=-1)
+    most = CHECKPOINT * float(way[-1])
+    steps = max(1, int((way >= most).nonzero()[0]))
+    return (1000 * most * CONTROL_FREQUENCY / steps,)
+
+
+_POINTS = _points(24, (-12, -20, 6), (12, 20, 32))
 
 register_family(
     Family(
@@ -154,7 +206,9 @@ register_family(
             "outside": [(angle,) for angle in range(285, 360, 15)],
         },
         make=partial(make_member, "push_towards"),
+        measure=pushed_direction,
         code=_circle,
+        period=360,
     )
 )
 register_family(
@@ -167,6 +221,7 @@ register_family(
             "outside": [(0, 26, 20), (0, -26, 20), (0, 0, 38), (16, 20, 20), (-14, -24, 30)],
         },
         make=partial(make_member, "reach_hidden"),
+        measure=reached_point,
     )
 )
 register_family(
@@ -179,6 +234,7 @@ register_family(
             "outside": [(4,), (22,), (24,), (26,)],
         },
         make=partial(make_member, "lift_to_height"),
+        measure=lifted_height,
     )
 )
 register_family(
@@ -191,5 +247,6 @@ register_family(
             "outside": [(20,), (25,), (130,), (140,), (150,)],
         },
         make=partial(make_member, "reach_at_speed"),
+        measure=moved_speed,
     )
 )

@@ -207,6 +207,7 @@ def record_episode(
     noise: float,
     gains: ExpertGains | None = None,
     after: Sequence[Task] = (),
+    like: Sequence[Task] = (),
     **options: Any,
 ) -> Episode:
     """Records one episode of the scripted expert; ``seed`` reproduces it.
@@ -220,6 +221,8 @@ def record_episode(
         gains: gains of the experts; ``None`` for the defaults.
         after: tasks whose experts act first; the episode starts in the state in which the last of
             them succeeded. If empty, it starts in the skill's own starting state.
+        like: tasks with the same kind of skill, whose experts act instead, each for its share of
+            the episode: a behaviour that does not know what this task asks for.
         **options: ``robot``, ``gripper`` and ``stepper`` of
             :class:`~torchrl_bmrl.envs.tabletop.TabletopEnv`.
 
@@ -228,7 +231,7 @@ def record_episode(
         a composition ``stages``. The attribute ``env_args`` is robomimic's.
 
     Raises:
-        BMRLError: if the experts of ``after`` fail from 100 starts.
+        BMRLError: if the experts of ``after`` fail from 100 starts, or ``like`` has other skills.
 
     Example:
         >>> from torchrl_bmrl.tasks import get_task
@@ -239,6 +242,12 @@ def record_episode(
     """
     from torchrl_bmrl.envs.robosuite_names import robosuite_metadata
 
+    acted = [skill for task in like for skill in task.options["skills"]]
+    if acted and (len(skills) > 1 or {type(skill) for skill in acted} != {type(skills[0])}):
+        raise BMRLError(
+            f"like is {', '.join(task.name for task in like)}; valid: tasks with the same kind of "
+            f"skill as {'-'.join(skill.name for skill in skills)}, which must be one"
+        )
     before, experts_before = _chain(after)
     env = _env((*before, *skills), options)
     scene = env.robosuite_env
@@ -260,10 +269,14 @@ def record_episode(
             f"the experts of {'-'.join(skill.name for skill in before)} failed from {MAX_ATTEMPTS} "
             "starts; valid in after: tasks that their experts solve"
         )
+    # A composition's experts have different phases; its stages are stored instead.
+    alone = len(skills) == 1
     observations = {name: [part] for name, part in observation.items()}
     model_file = scene.scene_xml()
     actions, rewards, successes, phases, states, stages = [], [], [], [], [], []
-    for _ in range(horizon):
+    for step in range(horizon):
+        if acted and isinstance(expert, Expert):
+            expert.skill = acted[step * len(acted) // horizon]
         action = act()
         phases.append(expert.phase)
         states.append(scene.sim.get_state().flatten())
@@ -275,8 +288,6 @@ def record_episode(
         rewards.append(reward)
         successes.append(scene.skill_success() if before else info["success"])
     parts = {name: np.stack(rows) for name, rows in observations.items()}
-    # A composition's experts have different phases; its stages are stored instead.
-    alone = len(skills) == 1
     return Episode(
         observations={name: part[:-1] for name, part in parts.items()},
         next_observations={name: part[1:] for name, part in parts.items()},
@@ -295,6 +306,7 @@ def record_episode(
             **({"phase_names": list(expert.phases)} if alone else {}),
             "model_file": model_file,
             **({"after": "-".join(skill.name for skill in before)} if before else {}),
+            **({"like": ", ".join(task.name for task in like)} if like else {}),
             "env_args": robosuite_metadata(
                 skills, options.get("robot", "Sawyer"), options.get("gripper", "default")
             ),

@@ -33,8 +33,9 @@ POOLINGS = ("mean", "attention")
 class ContextNetwork(nn.Module):
     r"""Embeds each transition of a set, pools the embeddings, and maps the result to m.
 
-    .. math:: m = \rho\Big(\sum_k w_k\, \phi(s_k, a_k, r_k, s'_k)\Big),
-        \quad w_k = 1/K \ \text{ or } \ \mathrm{softmax}_k\, \psi(s_k, a_k, r_k, s'_k)
+    .. math:: m = \rho\Big(\sum_k w_k\, \phi(x_k)\Big),
+        \quad w_k = 1/K \ \text{ or } \ \mathrm{softmax}_k\, \psi(x_k),
+        \quad x_k = (s_k, a_k, r_k, (s'_k - s_k) / \sigma)
 
     Reference: Zaheer et al., *Deep Sets*, NeurIPS 2017, https://arxiv.org/abs/1703.06114; the
     attention is the pooling with one seed vector of Lee et al., *Set Transformer*, ICML 2019,
@@ -46,7 +47,11 @@ class ContextNetwork(nn.Module):
         pooling: ``"mean"`` or ``"attention"``.
         num_features: size of φ.
         num_cells: widths of the hidden layers of φ and ψ together, and of ρ.
+        step_scale: σ, how far each number of the observation moves in a step, ``(obs_dim,)``. A
+            step is much smaller than the spread of the observations that a network is made for.
     """
+
+    step_scale: Tensor
 
     def __init__(
         self,
@@ -55,15 +60,20 @@ class ContextNetwork(nn.Module):
         pooling: str,
         num_features: int,
         num_cells: Sequence[int],
+        step_scale: Tensor,
     ) -> None:
         super().__init__()
+        self.register_buffer("step_scale", step_scale.detach().clone())
         self.attends = pooling == "attention"
         self.each = make_mlp(transition_dim, num_features + self.attends, num_cells)
         self.whole = make_mlp(num_features, task_latent_dim, num_cells[-1:])
 
-    def features(self, *transition: Tensor) -> Tensor:
+    def features(
+        self, observation: Tensor, action: Tensor, reward: Tensor, following: Tensor
+    ) -> Tensor:
         """φ and, with attention, ψ of each transition, ``(*B, K, n)``."""
-        return self.each(torch.cat(transition, -1))
+        step = (following - observation) / self.step_scale
+        return self.each(torch.cat([observation, action, reward, step], -1))
 
     def combine(self, features: Tensor, mask: Tensor) -> Tensor:
         """m of the transitions that count, ``(*B, m)``.
@@ -81,8 +91,8 @@ class ContextNetwork(nn.Module):
 
     def forward(self, *context: Tensor) -> Tensor:
         """m of a context: the entries of :data:`CONTEXT_KEYS`."""
-        *transition, mask = context
-        return self.combine(self.features(*transition), mask)
+        observation, action, reward, following, mask = context
+        return self.combine(self.features(observation, action, reward, following), mask)
 
 
 def make_context_encoder(
@@ -93,6 +103,7 @@ def make_context_encoder(
     pooling: str = "attention",
     num_features: int = 64,
     num_cells: Sequence[int] = (256, 256),
+    step_scale: Sequence[float] | Tensor | None = None,
 ) -> TensorDictModule:
     """Encoder :math:`M` of a set of transitions.
 
@@ -108,6 +119,8 @@ def make_context_encoder(
         pooling: ``"mean"``, or ``"attention"``: a weighted mean with learned weights.
         num_features: size of the embedding of one transition.
         num_cells: widths of the hidden layers.
+        step_scale: standard deviation of each number's change in a step, which the change is
+            divided by, ``(observation_dim,)``; ``None`` for 1.
 
     Raises:
         UnknownNameError: for another pooling.
@@ -122,7 +135,9 @@ def make_context_encoder(
     if pooling not in POOLINGS:
         raise UnknownNameError("pooling", pooling, POOLINGS)
     size = 2 * observation_dim + action_dim + 1
-    network = ContextNetwork(size, task_latent_dim, pooling, num_features, num_cells)
+    scale = torch.ones(observation_dim) if step_scale is None else torch.as_tensor(step_scale)
+    scale = scale.to(torch.get_default_dtype())
+    network = ContextNetwork(size, task_latent_dim, pooling, num_features, num_cells, scale)
     sizes = {
         (CONTEXT, "observation"): observation_dim,
         (CONTEXT, "action"): action_dim,
@@ -156,6 +171,12 @@ def as_context(transitions: TensorDictBase, mask: Tensor | None = None) -> Tenso
 
     Raises:
         BMRLError: for no transition, or a missing key.
+
+    Example:
+        >>> after = {"observation": torch.randn(9, 3), "reward": torch.randn(9, 1)}
+        >>> data = {"observation": torch.randn(9, 3), "action": torch.randn(9, 2), "next": after}
+        >>> as_context(TensorDict(data, [9]))["context"].shape
+        torch.Size([9])
     """
     shape = transitions.batch_size
     if not shape or not shape[-1]:
@@ -214,6 +235,10 @@ class ContextTaskLatent(PrototypeTaskLatent):
         encoder: :func:`make_context_encoder`'s module, trained.
         context: transitions that the context starts with in each episode, batch ``[K]``, or
             ``[*B, K]`` for the environments of a batch; ``None`` for none.
+
+    Raises:
+        BMRLError: for an encoder of single transitions, or a context that :func:`as_context`
+            refuses.
 
     Example:
         >>> from torchrl.envs import TransformedEnv

@@ -49,6 +49,7 @@ def collect(run: Run) -> None:
             recorded,
             settings.train_episodes,
             valid_episodes=settings.valid_episodes,
+            context_episodes=settings.context_episodes,
             noise=settings.noise,
             gains=settings.gains,
             seed=run.settings.seed,

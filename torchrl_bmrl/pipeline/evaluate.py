@@ -21,10 +21,10 @@ from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
 from torchrl_bmrl.experts.settings import ExpertSettings
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
-from torchrl_bmrl.pipeline.agents import Student
 from torchrl_bmrl.pipeline.held_out import evaluate_held_out
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.stage1 import make_policy
+from torchrl_bmrl.pipeline.student import Student
 from torchrl_bmrl.reports import Embeddings, write_report
 from torchrl_bmrl.reports.films import explore_demonstrations
 from torchrl_bmrl.run.folder import read_versions

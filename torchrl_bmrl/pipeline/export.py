@@ -13,9 +13,9 @@ from torchrl_bmrl.evaluation import read_results, summarise
 from torchrl_bmrl.export import export_policy
 from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
-from torchrl_bmrl.pipeline.agents import Student
 from torchrl_bmrl.pipeline.evaluate import held_out_episode, run_facts
 from torchrl_bmrl.pipeline.run import Run
+from torchrl_bmrl.pipeline.student import Student
 from torchrl_bmrl.reports.tables import results_table
 from torchrl_bmrl.run.folder import read_versions
 from torchrl_bmrl.training.checkpoint import save_checkpoint

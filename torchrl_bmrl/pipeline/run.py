@@ -26,12 +26,25 @@ from torchrl_bmrl.envs.transforms import ObservationStatistics, make_env
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome, evaluate_policy
 from torchrl_bmrl.objectives import BCQLoss
-from torchrl_bmrl.pipeline.agents import Student, load_bcq_loss, load_student
+from torchrl_bmrl.pipeline.agents import load_bcq_loss
 from torchrl_bmrl.pipeline.settings import SIX_TASKS, Settings
-from torchrl_bmrl.pipeline.task_files import make_tasks, read_task_file
+from torchrl_bmrl.pipeline.student import Student, load_student
+from torchrl_bmrl.pipeline.task_files import (
+    check_names,
+    make_tasks,
+    read_task_file,
+    train_episodes,
+    with_run_options,
+)
 from torchrl_bmrl.run.locks import lock_run
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
-from torchrl_bmrl.tasks import Task, compose_tasks, get_task
+from torchrl_bmrl.tasks import (
+    Family,
+    Task,
+    compose_tasks,
+    get_family,
+    registered_families,
+)
 
 log = logging.getLogger(__name__)
 
@@ -74,10 +87,10 @@ class Run:
         made = make_tasks(tasks)
         if settings.robot and not any("robot" in task.options for task in made):
             raise ConfigError(f"robot is {settings.robot}; valid for tasks without robosuite: null")
-        self.tasks = tuple(_with_run_options(task, settings) for task in made)
-        _check_names(settings, self.tasks)
+        self.tasks = tuple(with_run_options(task, settings) for task in made)
+        check_names(settings, self.tasks)
         self.folder = Path(settings.run_dir)
-        episodes = _train_episodes(settings, self.tasks)
+        episodes = train_episodes(settings, self.tasks)
         collect = replace(settings.collect, train_episodes=episodes)
         self.settings = replace(settings, tasks=tasks, collect=collect)
         if (only := settings.only) is not None:
@@ -157,6 +170,26 @@ class Run:
             raise UnknownNameError("task of the run", name, self.names)
         return self.tasks[self.names.index(name)]
 
+    @property
+    def family(self) -> Family:
+        """The family whose trained members are the tasks of the run.
+
+        Raises:
+            ConfigError: if they are not those of one family.
+        """
+        for name in registered_families():
+            family = get_family(name)
+            if tuple(task.name for task in family.tasks("train")) == self.names:
+                return family
+        raise ConfigError(
+            f"tasks is {', '.join(self.names)}; valid: the trained members of one family, such as "
+            f"tasks=[{registered_families()[0]}]"
+        )
+
+    def codes(self) -> list[tuple[float, ...]]:
+        """Numbers that a policy is given which is told the task, for each task of the family."""
+        return [self.family.told(name) for name in self.names]
+
     def composition(self, name: str) -> Task:
         """Returns a composition of the run's tasks.
 
@@ -208,7 +241,7 @@ class Run:
 
         Args:
             name: name of the task.
-            split: ``"train"`` or ``"valid"``.
+            split: ``"train"``, ``"valid"`` or ``"context"``.
         """
         index = self.names.index(name)
         return load_transitions(
@@ -348,41 +381,3 @@ class Run:
         if horizon is not None:
             return horizon
         return int(self.transitions(task.name, "train")["step"].max()) + 1
-
-
-def _with_run_options(task: Task, settings: Settings) -> Task:
-    """Returns the task with the run's robot and stepper, if it has these options."""
-    chosen = {"stepper": settings.stepper, "robot": settings.robot}
-    known = {key: x for key, x in chosen.items() if x is not None and key in task.options}
-    return task.with_options(**known)
-
-
-def _check_names(settings: Settings, tasks: Sequence[Task]) -> None:
-    """Raises an error for settings of unknown tasks; other registered tasks are allowed."""
-    episodes, after = settings.collect.train_episodes, settings.collect.after
-    experts, names = settings.collect.experts, [task.name for task in tasks]
-    parts = [part for entries in after.values() for entry in entries for part in entry.split("-")]
-    for name in [*episodes, *after, *experts, *filter(None, parts)]:
-        if name not in ("default", *names):
-            get_task(name)
-    for task in tasks:
-        if task.record is None and task.name in experts:
-            raise ConfigError(
-                f"collect.experts has {task.name}, whose demonstrations are files; valid: tasks "
-                "with a scripted expert, or default"
-            )
-
-
-def _train_episodes(settings: Settings, tasks: Sequence[Task]) -> dict[str, int]:
-    """Returns the number of episodes to record for each task."""
-    given = settings.collect.train_episodes
-    recorded = [task.name for task in tasks if task.record is not None]
-    for name in recorded:
-        if name not in given and "default" not in given:
-            raise ConfigError(
-                f"collect.train_episodes has {', '.join(given) or 'nothing'}; valid: a number "
-                f"for {name}, or for default"
-            )
-    # Numbers for tasks that are not in the run stay, as in folders of earlier versions.
-    named = {name: number for name, number in given.items() if name != "default"}
-    return {name: given.get(name, given.get("default", 0)) for name in recorded} | named

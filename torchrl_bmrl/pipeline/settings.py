@@ -14,7 +14,8 @@ from torchrl_bmrl.objectives.checks import check_value_bounds
 from torchrl_bmrl.objectives.common import LOSS_FUNCTIONS
 from torchrl_bmrl.objectives.distillation import CONTEXTS, ENCODER_TERMS
 from torchrl_bmrl.objectives.generative import KL_REDUCTIONS
-from torchrl_bmrl.pipeline.agents import GENERATORS, LATENT_SOURCES, TASK_ENCODERS
+from torchrl_bmrl.pipeline.agents import GENERATORS
+from torchrl_bmrl.pipeline.student import LATENT_SOURCES, OF_SETS, TASK_ENCODERS
 from torchrl_bmrl.run.folder import deciding
 from torchrl_bmrl.run.loggers import LOGGERS
 from torchrl_bmrl.run.settings import check_settings, setting
@@ -38,6 +39,8 @@ class CollectSettings:
         {"default": 60, **dict.fromkeys(SIX_TASKS, 60), "lift": 80}, above=0
     )
     valid_episodes: int = setting(6, above=0)  # held-out episodes of each task
+    # Episodes of each task in which the experts of the other tasks act, for distill.context=given.
+    context_episodes: int = setting(0, at_least=0)
     noise: float = setting(0.2, at_least=0)  # standard deviation in each action dimension
     # By task: tasks whose experts act before an episode, in turn, for starts as in a composition.
     after: dict[str, list[str]] = field(default_factory=dict)
@@ -124,17 +127,53 @@ class DistillSettings:
     context_size: int = setting(8, above=0)  # transitions in a set
     # Terms whose gradient trains the encoder.
     encoder_terms: list[str] = setting(list(ENCODER_TERMS), choices=ENCODER_TERMS)
-    classification_weight: float = setting(1.0, at_least=0)  # weight of the task's cross-entropy
+    # Weight of the task's cross-entropy; null: no classifier.
+    classification_weight: float | None = setting(1.0, at_least=0)
     generator_weight: float = setting(1.0, at_least=0)  # weight of the actions' loss
     direction_weight: float = setting(1.0, at_least=0)  # weight of the gradient direction
     qvalue_weight: float = setting(1.0, at_least=0)  # weight of the values' loss
     latent_norm_weight: float = setting(2e-3, at_least=0)  # weight of the squared norm of m
     metric_weight: float = setting(0.0, at_least=0)  # weight of the triplet loss on m
     metric_margin: float = setting(1.0, at_least=0)  # margin of the triplet loss
+    distance_weight: float = setting(0.0, at_least=0)  # weight of FOCAL's distance on m
+    contrastive_weight: float = setting(0.0, at_least=0)  # weight of InfoNCE on m
+    temperature: float = setting(0.1, above=0)  # temperature of InfoNCE
     isometry_weight: float = setting(1.0, at_least=0)  # weight of the isometry of m
     advantage_weight: float = setting(0.0, at_least=0)  # weight of differences within a state
     normalise_qvalue: bool = True  # with each teacher's mean and deviation
     prototype: str = setting("mean", choices=("mean", "medoid"))  # a task's point of m
+
+    def check(self, latent_sources: list[str]) -> None:
+        """Checks that the settings fit what the encoder of m reads.
+
+        Args:
+            latent_sources: the run's sources of m when it is evaluated.
+
+        Raises:
+            ConfigError: naming the setting, its value and the valid values.
+        """
+        needs: dict[str, Any] = {}
+        if self.task_encoder in OF_SETS:
+            needs = {"context_fraction": 1, "isometry_weight": 0}
+            if self.context not in ("set", "given"):
+                needs["context"] = "set or given"
+            elif self.batch_size < 2 * self.context_size:
+                needs["batch_size"] = f"at least {2 * self.context_size}, two contexts"
+        elif self.context == "given":
+            needs["task_encoder"] = " or ".join(OF_SETS)
+        if self.task_encoder in ("one_hot", "told", "nothing"):
+            needs["isometry_weight"] = 0
+            if latent_sources != ["prototype"]:
+                raise ConfigError(
+                    f"distill.task_encoder is {self.task_encoder}, which does not read "
+                    f"transitions, and evaluate.latent_sources {latent_sources}; valid: [prototype]"
+                )
+        for name, valid in needs.items():
+            if (value := getattr(self, name)) != valid:
+                raise ConfigError(
+                    f"distill.{name} is {value}; valid with distill.task_encoder="
+                    f"{self.task_encoder}: {valid}"
+                )
 
 
 @dataclass
@@ -215,12 +254,10 @@ class Settings:
                     f"bcq.{name} is {value}, and bcq.generator={bcq.generator} does not read it; "
                     f"valid with this generator: {default}, the default"
                 )
-        if distill.task_encoder == "one_hot" and (
-            evaluate.latent_sources != ["prototype"] or distill.isometry_weight
-        ):
+        distill.check(evaluate.latent_sources)
+        if distill.context == "given" and not self.collect.context_episodes:
             raise ConfigError(
-                "distill.task_encoder is one_hot, which does not read transitions; valid with it: "
-                "evaluate.latent_sources=[prototype] and distill.isometry_weight=0"
+                "distill.context is given and collect.context_episodes 0; valid: at least 1"
             )
         if self.only is not None and self.bcq.stacked:
             raise ConfigError(f"only is {self.only}; valid with bcq.stacked: null")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from contextlib import ExitStack
 from copy import deepcopy
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -13,12 +15,12 @@ from torch import Tensor
 
 from torchrl_bmrl.data import make_multi_task_replay_buffer, with_previous
 from torchrl_bmrl.functional import nonzero_scale, sample_action_latent
-from torchrl_bmrl.modules import BCQPolicy
+from torchrl_bmrl.modules import BCQPolicy, reads_context
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
-from torchrl_bmrl.pipeline.agents import Student, make_distillation_loss
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.settings import DistillSettings
 from torchrl_bmrl.pipeline.stage1 import sizes_of
+from torchrl_bmrl.pipeline.student import OF_SETS, Student, make_distillation_loss
 from torchrl_bmrl.pipeline.training_data import deviation
 from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
 from torchrl_bmrl.run.workers import Report
@@ -59,7 +61,7 @@ def stage2(run: Run) -> None:
     run.check_single_actions("the distillation")
     run.jobs(
         train_student,
-        [None],
+        [StudentJob(run.settings.distill, "distill")],
         workers=1,
         total=run.settings.distill.updates,
         description="stage 2: distilling",
@@ -102,25 +104,65 @@ def advantage_scale(
     return scale if qvalue_scale is None else scale / qvalue_scale
 
 
+@dataclass(frozen=True)
+class StudentJob:
+    """A student to train.
+
+    Attributes:
+        settings: of stage 2.
+        folder: of its checkpoint, below the run's folder.
+    """
+
+    settings: DistillSettings
+    folder: str
+
+
 def loss_options(settings: DistillSettings) -> dict[str, Any]:
     """Returns the settings that are options of :class:`.MetaDistillationLoss`."""
     others = OF_THE_STUDENT + OF_THE_TRAINING
     return {name: x for name, x in vars(settings).items() if name not in others}
 
 
-def train_student(job: tuple[Run, None], report: Report) -> None:
-    """Trains the student, or resumes from its checkpoint."""
-    run, _ = job
+def make_sampler(
+    run: Run, distill: DistillSettings, train: list[TensorDictBase]
+) -> Callable[[], TensorDictBase]:
+    """Returns a function that returns a batch ``[num_tasks, batch_size]``, with its context.
+
+    Args:
+        run: the run.
+        distill: settings of stage 2. With ``context="given"`` each row has a transition under
+            ``"context"``, half of them of another behaviour if the demonstrations have any.
+        train: the demonstrations, ``[N_i]`` each.
+    """
+    options: dict[str, Any] = {"batch_size": distill.batch_size, "device": run.settings.device}
+    buffer = make_multi_task_replay_buffer(train, **options)
+    if distill.context != "given":
+        return buffer.sample
+    own = [data.select(*TRANSITION_KEYS) for data in train]
+    others = [run.transitions(name, "context").select(*TRANSITION_KEYS) for name in run.names]
+    buffers = [make_multi_task_replay_buffer(data, **options) for data in (own, others)]
+
+    def sample() -> TensorDictBase:
+        # Contexts of one behaviour, of the other, and mixed.
+        first, second = (contexts.sample().exclude("index") for contexts in buffers)
+        share = torch.rand(len(train), 1, device=first.device)
+        chosen = torch.rand(first.batch_size, device=first.device) < share
+        return buffer.sample().set("context", torch.where(chosen, first, second))
+
+    return sample
+
+
+def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
+    """Trains a student, or resumes from its checkpoint."""
+    run, student_job = job
     keep_freed_memory()
-    settings, distill = run.settings, run.settings.distill
+    settings, distill = run.settings, student_job.settings
     train, valid = (
         [run.transitions(name, split) for name in run.names] for split in ("train", "valid")
     )
     if distill.context == "previous":
         train = [with_previous(data, TRANSITION_KEYS) for data in train]
-    buffer = make_multi_task_replay_buffer(
-        train, batch_size=distill.batch_size, device=settings.device
-    )
+    sample = make_sampler(run, distill, train)
 
     torch.manual_seed(run.seed("distill"))
     losses = [run.teacher(name) for name in run.names]
@@ -129,9 +171,14 @@ def train_student(job: tuple[Run, None], report: Report) -> None:
         "num_tasks": len(run.names),
         **{name: getattr(distill, name) for name in OF_THE_STUDENT},
         "latent_dim": teachers[0].latent_dim,
+        **({"code_dim": len(run.codes()[0])} if distill.task_encoder == "told" else {}),
         **sizes_of(train[0]),
     }
     student = Student(**options)
+    if distill.task_encoder == "told":
+        student.set_codes(run.codes())
+    elif distill.task_encoder in OF_SETS:
+        student.set_step_scale(train)
     normalisation = value_statistics(teachers, train) if distill.normalise_qvalue else (None, None)
     loss = make_distillation_loss(
         student,
@@ -145,7 +192,7 @@ def train_student(job: tuple[Run, None], report: Report) -> None:
         **loss_options(distill),
     ).to(settings.device)
     optimizer = make_adam(loss.parameters(), lr=distill.lr)
-    path = run.folder / "distill" / "checkpoint.safetensors"
+    path = run.folder / student_job.folder / "checkpoint.safetensors"
     saved = resume_training(
         path, student, {"student": optimizer}, kind="student", device=settings.device
     )
@@ -209,11 +256,13 @@ def train_student(job: tuple[Run, None], report: Report) -> None:
         log.debug("distillation: update %d saved, accuracy %.1f%%", number, 100 * accuracy)
 
     with ExitStack() as stack:
-        logger = make_logger(settings.logger, run.folder, "distill", done)
+        logger = make_logger(
+            settings.logger, run.folder, student_job.folder.replace("/", "_"), done
+        )
         stack.callback(close_logger, logger)
         fit(
             step,
-            buffer.sample,
+            sample,
             start=done,
             total=distill.updates,
             every=Every(log=settings.log_interval, save=settings.checkpoint_interval),
@@ -228,7 +277,11 @@ def proposals(
     student: Student, batch: TensorDictBase, latent_clip: float | None, device: str
 ) -> Tensor:
     """Returns candidates of the student, ``(num_tasks, B, candidates, action_dim)``."""
-    data = batch.select("observation").set("task_latent", student.embed(batch))
+    if reads_context(student.task_encoder):
+        m = student.embed_context(batch).unsqueeze(1).expand(*batch.batch_size, -1)
+    else:
+        m = student.embed(batch)
+    data = batch.select("observation").set("task_latent", m)
     data = data.unsqueeze(-1).expand(*data.batch_size, 10)
     on_gpu = torch.device(device).type == "cuda"
     # Training draws the same random numbers with and without this check.

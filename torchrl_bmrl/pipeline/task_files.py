@@ -1,4 +1,7 @@
-"""Builds the tasks of a run from registered names, or from a YAML file of a user's tasks."""
+"""Builds the tasks of a run from registered names, or from a YAML file of a user's tasks.
+
+It also checks the settings that name tasks.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from typing import Any
 from torchrl_bmrl.data.options import ReadOptions
 from torchrl_bmrl.envs.gym import make_gym_env
 from torchrl_bmrl.errors import BMRLError, ConfigError
+from torchrl_bmrl.pipeline.settings import Settings
 from torchrl_bmrl.run.folder import read_yaml
 from torchrl_bmrl.tasks import DemonstrationFiles, Task, get_task, tasks_of
 
@@ -149,3 +153,41 @@ def _make_task(name: str, entry: Mapping[str, Any]) -> Task:
         success=None if success is None else "success",
         title=str(entry.get("title") or ""),
     )
+
+
+def with_run_options(task: Task, settings: Settings) -> Task:
+    """Returns the task with the run's robot and stepper, if it has these options."""
+    chosen = {"stepper": settings.stepper, "robot": settings.robot}
+    known = {key: x for key, x in chosen.items() if x is not None and key in task.options}
+    return task.with_options(**known)
+
+
+def check_names(settings: Settings, tasks: Sequence[Task]) -> None:
+    """Raises an error for settings of unknown tasks; other registered tasks are allowed."""
+    episodes, after = settings.collect.train_episodes, settings.collect.after
+    experts, names = settings.collect.experts, [task.name for task in tasks]
+    parts = [part for entries in after.values() for entry in entries for part in entry.split("-")]
+    for name in [*episodes, *after, *experts, *filter(None, parts)]:
+        if name not in ("default", *names):
+            get_task(name)
+    for task in tasks:
+        if task.record is None and task.name in experts:
+            raise ConfigError(
+                f"collect.experts has {task.name}, whose demonstrations are files; valid: tasks "
+                "with a scripted expert, or default"
+            )
+
+
+def train_episodes(settings: Settings, tasks: Sequence[Task]) -> dict[str, int]:
+    """Returns the number of episodes to record for each task."""
+    given = settings.collect.train_episodes
+    recorded = [task.name for task in tasks if task.record is not None]
+    for name in recorded:
+        if name not in given and "default" not in given:
+            raise ConfigError(
+                f"collect.train_episodes has {', '.join(given) or 'nothing'}; valid: a number "
+                f"for {name}, or for default"
+            )
+    # Numbers for tasks that are not in the run stay, as in folders of earlier versions.
+    named = {name: number for name, number in given.items() if name != "default"}
+    return {name: given.get(name, given.get("default", 0)) for name in recorded} | named
