@@ -45,16 +45,15 @@ class MBMLLoss(MetaDistillationLoss):
     and symbols are those of :class:`~torchrl_bmrl.objectives.MetaDistillationLoss`, without a
     classifier. As published, the last two terms and the value train M, the action's does not.
 
-    :attr:`published` has the settings of the published code
-    (https://github.com/Ji4chenLi/Multi-Task-Batch-RL). Deviations from it: m is a point, where the
-    publication has a product of Gaussians. So distances are Euclidean, not divergences (of
-    Gaussians of unit variance a divergence is half the squared distance; a margin of 2 is the same
-    number in both), and a penalty on m replaces the divergence from the prior. One other task is
-    drawn for each task, not all. The critic is distilled at the student's action for a latent, not
-    at the data's action, and normalised: published values are not, and outweigh the triplet's term.
-    So try weights below the published 1, such as 0.1, if the actions do not follow m. Perturbation
-    networks are not distilled. Rewards alone are relabelled, not next observations (published for
-    Walker only).
+    :attr:`published` has the settings of the published code (https://github.com/Ji4chenLi/Multi-
+    Task-Batch-RL). Deviations from it: m is a point, where the publication has a product of
+    Gaussians. So distances are Euclidean, not divergences (of Gaussians of unit variance a
+    divergence is half the squared distance, so that of 2 is a distance of 2), and a penalty on m
+    replaces the divergence from the prior. One other task is drawn for each task, not all. The
+    critic is distilled at the student's action for a latent, not at the data's action, and
+    normalised: published values are not, and outweigh the triplet's term. So try weights below the
+    published 1, such as 0.1, if the actions do not follow m. Perturbation networks are not
+    distilled. Rewards alone are relabelled, not next observations (published for Walker only).
 
     Args:
         task_encoder: M, of sets that contain the reward (``make_context_encoder``).
