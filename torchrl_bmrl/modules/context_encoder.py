@@ -19,6 +19,7 @@ from torchrl_bmrl.modules.generator import Network, make_mlp
 from torchrl_bmrl.modules.task_latent import (
     TRANSITION_KEYS,
     PrototypeTaskLatent,
+    check_reads_transitions,
     last_transition,
     only_in_environments,
 )
@@ -91,8 +92,10 @@ class ContextNetwork(nn.Module):
 
     def forward(self, *context: Tensor) -> Tensor:
         """m of a context: the entries of :data:`CONTEXT_KEYS`."""
-        observation, action, reward, following, mask = context
-        return self.combine(self.features(observation, action, reward, following), mask)
+        *entries, mask = context
+        # What does not count may hold anything, also no numbers, which a weight of 0 leaves in.
+        entries = [entry.masked_fill(~mask.unsqueeze(-1), 0) for entry in entries]
+        return self.combine(self.features(*entries), mask)
 
 
 def make_context_encoder(
@@ -124,6 +127,7 @@ def make_context_encoder(
 
     Raises:
         UnknownNameError: for another pooling.
+        BMRLError: for a ``step_scale`` of another size, or with a number that is not positive.
 
     Example:
         >>> encoder = make_context_encoder(3, 2, task_latent_dim=4)
@@ -137,6 +141,10 @@ def make_context_encoder(
     size = 2 * observation_dim + action_dim + 1
     scale = torch.ones(observation_dim) if step_scale is None else torch.as_tensor(step_scale)
     scale = scale.to(torch.get_default_dtype())
+    if scale.shape != (observation_dim,) or not (scale.isfinite() & (scale > 0)).all():
+        raise BMRLError(
+            f"step_scale is {scale.tolist()}; valid: {observation_dim} finite numbers above 0"
+        )
     network = ContextNetwork(size, task_latent_dim, pooling, num_features, num_cells, scale)
     sizes = {
         (CONTEXT, "observation"): observation_dim,
@@ -164,13 +172,14 @@ def as_context(transitions: TensorDictBase, mask: Tensor | None = None) -> Tenso
 
     Args:
         transitions: batch ``[*B, K]``, with :data:`~torchrl_bmrl.modules.TRANSITION_KEYS`.
-        mask: which of them count, ``(*B, K)``; ``None`` if all do.
+        mask: which of them count, boolean, ``(*B, K)``, at least one of each set; ``None`` if all
+            do.
 
     Returns:
         batch ``[*B]``, with the transitions and ``mask`` under ``"context"``.
 
     Raises:
-        BMRLError: for no transition, or a missing key.
+        BMRLError: for no transition, a missing key, or a mask that does not fit.
 
     Example:
         >>> after = {"observation": torch.randn(9, 3), "reward": torch.randn(9, 1)}
@@ -189,6 +198,11 @@ def as_context(transitions: TensorDictBase, mask: Tensor | None = None) -> Tenso
     if mask is None:
         device = chosen.get("observation").device
         mask = torch.ones(shape, dtype=torch.bool, device=device)
+    elif mask.shape != shape or mask.dtype != torch.bool or not mask.any(-1).all():
+        raise BMRLError(
+            f"the mask is {mask.dtype} of shape {list(mask.shape)}; valid: torch.bool of shape "
+            f"{list(shape)}, with at least one transition of each set"
+        )
     return TensorDict({CONTEXT: chosen.set("mask", mask)}, batch_size=shape[:-1])
 
 
@@ -205,7 +219,8 @@ def embed_context(encoder: TensorDictModule, transitions: TensorDictBase) -> Ten
         ``(*B, m)``.
 
     Raises:
-        BMRLError: for no transition, a missing key, or sizes that the encoder does not take.
+        BMRLError: for no transition, a missing key, sizes that the encoder does not take, or an
+            encoder that reads something else.
 
     Example:
         >>> from torchrl_bmrl.modules import make_task_encoder
@@ -215,6 +230,8 @@ def embed_context(encoder: TensorDictModule, transitions: TensorDictBase) -> Ten
         torch.Size([2])
     """
     context = as_context(transitions)
+    if not reads_context(encoder):
+        check_reads_transitions(encoder)
     try:
         if reads_context(encoder):
             return encoder(context).get("task_latent")
@@ -238,7 +255,7 @@ class ContextTaskLatent(PrototypeTaskLatent):
 
     Raises:
         BMRLError: for an encoder of single transitions, or a context that :func:`as_context`
-            refuses.
+            refuses; at a reset, if the context's batch is not the environment's.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -249,6 +266,8 @@ class ContextTaskLatent(PrototypeTaskLatent):
         >>> latent.shape, latent[0]
         (torch.Size([3, 4]), tensor([0., 0., 0., 0.]))
     """
+
+    given: Tensor | None
 
     def __init__(
         self,
@@ -261,7 +280,8 @@ class ContextTaskLatent(PrototypeTaskLatent):
             raise BMRLError("the encoder reads single transitions; valid: make_context_encoder")
         self.encoder = encoder
         self.network = cast(ContextNetwork, encoder.module)
-        self.given = None if context is None else self._features(as_context(context))
+        given = None if context is None else self._features(as_context(context))
+        self.register_buffer("given", given)
         self._kept: Tensor | None = None
         self._valid: Tensor | None = None
 
@@ -274,18 +294,30 @@ class ContextTaskLatent(PrototypeTaskLatent):
     ) -> TensorDictBase:
         shape = tensordict_reset.batch_size
         reset = None if tensordict is None else tensordict.get("_reset", None)
-        if reset is None or self._valid is None:
-            first = self.given
-            if first is None:
-                self._kept = self._valid = None
-            else:
-                self._kept = first.expand(*shape, *first.shape[-2:])
-                self._valid = torch.ones(self._kept.shape[:-1], dtype=torch.bool)
+        if reset is None or self._kept is None or self._valid is None:
+            self._begin(shape)
         else:  # some of several environments begin anew
             given = 0 if self.given is None else self.given.shape[-2]
-            number = torch.arange(self._valid.shape[-1])
-            self._valid = self._valid & ~(reset.reshape(*shape, 1) & (number >= given))
+            number = torch.arange(self._valid.shape[-1], device=self._valid.device)
+            valid = self._valid & ~(reset.reshape(*shape, 1) & (number >= given))
+            # What counts nowhere any more would stay in memory for ever.
+            used = valid.reshape(-1, valid.shape[-1]).any(0)
+            self._kept, self._valid = self._kept[..., used, :], valid[..., used]
         return self._write(tensordict_reset)
+
+    def _begin(self, shape: torch.Size) -> None:
+        """All environments begin anew."""
+        if self.given is None:
+            self._kept = self._valid = None
+            return
+        batch = self.given.shape[:-2]
+        if batch and batch != shape:
+            raise BMRLError(
+                f"a context of batch {tuple(batch)} in an environment of {tuple(shape)}; valid: "
+                "one context, or one for each"
+            )
+        self._kept = self.given.expand(*shape, *self.given.shape[-2:])
+        self._valid = self._kept.new_ones(self._kept.shape[:-1], dtype=torch.bool)
 
     def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
         shape = tensordict.batch_size
@@ -301,7 +333,7 @@ class ContextTaskLatent(PrototypeTaskLatent):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         last = last_transition(tensordict, next_tensordict).unsqueeze(-1)
         features = self._features(as_context(last))
-        valid = torch.ones(features.shape[:-1], dtype=torch.bool)
+        valid = features.new_ones(features.shape[:-1], dtype=torch.bool)
         if self._kept is not None and self._valid is not None:
             features = torch.cat([self._kept, features], -2)
             valid = torch.cat([self._valid, valid], -1)

@@ -154,7 +154,7 @@ class DistillSettings:
         """
         needs: dict[str, Any] = {}
         if self.task_encoder in OF_SETS:
-            needs = {"context_fraction": 1, "isometry_weight": 0}
+            needs = {"context_fraction": 1, "isometry_weight": 0, "prototype": "mean"}
             if self.context not in ("set", "given"):
                 needs["context"] = "set or given"
             elif self.batch_size < 2 * self.context_size:

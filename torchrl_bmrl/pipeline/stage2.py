@@ -235,7 +235,8 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
     def save(number: int) -> None:
         own = student if settings.device == "cpu" else deepcopy(student).to("cpu")
         own.set_prototypes(train, distill.prototype)
-        accuracy = own.accuracy(torch.cat(valid))
+        classifies = distill.classification_weight is not None
+        accuracy = own.accuracy(torch.cat(valid)) if classifies else None
         metadata = {
             "kind": "student",
             "tasks": list(run.names),
@@ -254,7 +255,8 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
             device=settings.device,
             keep=settings.keep_checkpoints,
         )
-        log.debug("distillation: update %d saved, accuracy %.1f%%", number, 100 * accuracy)
+        said = "" if accuracy is None else f", accuracy {accuracy:.1%}"
+        log.debug("distillation: update %d saved%s", number, said)
 
     with ExitStack() as stack:
         logger = make_logger(

@@ -14,7 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.transforms import Transform
 
-from torchrl_bmrl.errors import BMRLError, CheckpointError, UnknownNameError
+from torchrl_bmrl.errors import BMRLError, CheckpointError, ConfigError, UnknownNameError
 from torchrl_bmrl.modules import (
     BCQPolicy,
     ContextTaskLatent,
@@ -128,9 +128,15 @@ class Student(nn.Module):
 
         Args:
             codes: numbers of each task, ``(num_tasks, code_dim)``.
+
+        Raises:
+            BMRLError: for another shape.
         """
         held = cast(Tensor, self.task_encoder.module.codes)
-        held.copy_(torch.tensor(codes, dtype=held.dtype))
+        table = torch.tensor(codes, dtype=held.dtype)
+        if table.shape != held.shape:
+            raise BMRLError(f"codes are of shape {tuple(table.shape)}; valid: {tuple(held.shape)}")
+        held.copy_(table)
 
     def set_step_scale(self, datasets: Sequence[TensorDictBase]) -> None:
         """Tells an encoder of sets how far each number of the observation moves in a step.
@@ -143,6 +149,21 @@ class Student(nn.Module):
         held = cast(Tensor, self.task_encoder.module.step_scale)
         # A number that hardly moves carries rounding errors, which must not be enlarged.
         held.copy_(torch.where(deviation > 1e-3, deviation, 1.0))
+
+    def check_embeds(self, what: str) -> None:
+        """Checks that single transitions have an embedding.
+
+        Args:
+            what: what needs it, for the message.
+
+        Raises:
+            ConfigError: for an encoder of sets.
+        """
+        if reads_context(self.task_encoder):
+            raise ConfigError(
+                f"{what} needs m of single transitions, and the policy's encoder reads sets of "
+                "them; valid: a policy trained with distill.task_encoder=transition"
+            )
 
     def embed_context(self, context: TensorDictBase) -> Tensor:
         """Returns the embedding m of a set of transitions of one task, ``(*B, task_latent_dim)``.
@@ -222,17 +243,20 @@ class Student(nn.Module):
 
         Raises:
             UnknownNameError: for another source.
-            BMRLError: as :class:`~torchrl_bmrl.modules.DemonstrationTaskLatent`.
+            BMRLError: without the demonstration that the last source needs, for an encoder that
+                reads no transitions, and as :class:`~torchrl_bmrl.modules.DemonstrationTaskLatent`.
         """
         if source == "prototype":
             return PrototypeTaskLatent(self.prototypes[task])
+        if source == "demonstration" and demonstration is None:
+            raise BMRLError("the source demonstration has none; valid: transitions of one episode")
         sets = reads_context(self.task_encoder)
         if source == "online":
             kind = ContextTaskLatent if sets else OnlineTaskLatent
             return kind(self.prototypes[task], self.task_encoder)
         if source == "demonstration":
+            assert demonstration is not None
             if sets:
-                assert demonstration is not None
                 return PrototypeTaskLatent(self.embed_context(demonstration))
             return DemonstrationTaskLatent(demonstration, self.task_encoder)
         raise UnknownNameError("latent source", source, LATENT_SOURCES)
@@ -320,7 +344,10 @@ def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
             f"{number} different names, one per prototype",
         ),
         "latent_clip": (lambda x: x is None or (_is_number(x) and x > 0), "a number above 0, null"),
-        "accuracy": (lambda x: _is_number(x) and 0 <= x <= 1, "a number between 0 and 1"),
+        "accuracy": (
+            lambda x: x is None or (_is_number(x) and 0 <= x <= 1),
+            "a number between 0 and 1, or null without a classifier",
+        ),
         "statistics": (_are_statistics, "loc and scale, as many numbers in each, scale above 0"),
     }
     for key, (holds, what) in valid.items():
