@@ -8,6 +8,7 @@ from torchrl_bmrl.objectives.distillation import MetaDistillationLoss
 from torchrl_bmrl.objectives.focal import FOCALLoss
 from torchrl_bmrl.objectives.fqe import FQELoss
 from torchrl_bmrl.objectives.generative import GenerativeLoss
+from torchrl_bmrl.objectives.inference import ContextInferenceLoss
 from torchrl_bmrl.objectives.mbml import MBMLLoss
 from torchrl_bmrl.objectives.plas import PLASLoss
 from torchrl_bmrl.objectives.rebrac import ReBRACLoss
@@ -16,6 +17,7 @@ from torchrl_bmrl.objectives.stacked import StackedLoss
 
 __all__ = [
     "BCQLoss",
+    "ContextInferenceLoss",
     "DiscreteBCQLoss",
     "FOCALLoss",
     "FQELoss",

@@ -250,9 +250,9 @@ class FOCALLoss(OfflineLoss):
         valid = self.valid_rows(tensordict, batch)
         outcomes(tensordict, self.tensor_keys, valid, torch.Size([*batch, 1]))
         rows = self.rows(tensordict, context_keys(self.task_encoder))
-        contexts, own = group_rows(rows, self.context_size, valid)
+        contexts, own, filled = group_rows(rows, self.context_size, valid)
         points = encode_contexts(self, contexts, rows)
-        return assign(points, own, apart=True), points
+        return assign(points, own, filled, apart=True), points
 
     @torch.no_grad()
     def _with_latent(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:

@@ -197,11 +197,11 @@ class MBMLLoss(MetaDistillationLoss):
 
     def _embed(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         rows, valid = self._transitions(tensordict)
-        contexts, own = group_rows(rows, self.context_size, valid)
+        contexts, own, filled = group_rows(rows, self.context_size, valid)
         relabelled, _ = self._relabelled(tensordict, rows, valid)
         both = torch.cat([contexts.get(CONTEXT), relabelled], -1)
         points = self._points(both, rows)
-        return assign(points, own, apart=True), points
+        return assign(points, own, filled, apart=True), points
 
     def _transitions(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor | None]:
         keys = context_keys(self.task_encoder)

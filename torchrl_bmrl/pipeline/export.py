@@ -26,8 +26,8 @@ log = logging.getLogger(__name__)
 CARD = """# The distilled policy of preset {preset}, seed {seed}
 
 One policy for {number} tasks ({tasks}), conditioned on a task embedding m of {dim} numbers.
-{parameters:,} parameters: the encoder of m{classifier}, the generator of actions and the critic that
-chooses among them. The file also contains a point of m for each task, the statistics that
+{parameters:,} parameters: the encoder of m{classifier}, the generator of actions and the critic
+that chooses among them. The file also contains a point of m for each task, the statistics that
 normalise observations, and one held-out demonstration of each task.
 
 ```bash

@@ -32,6 +32,7 @@ from torchrl_bmrl.modules import (
     prototype,
     reads_context,
 )
+from torchrl_bmrl.modules.context_encoder import ContextNetwork
 from torchrl_bmrl.objectives import MetaDistillationLoss
 from torchrl_bmrl.pipeline.agents import with_sizes
 from torchrl_bmrl.training.checkpoint import build, load_checkpoint
@@ -49,6 +50,7 @@ class Student(nn.Module):
             :meth:`set_codes`; ``"nothing"``: m is one zero.
         task_latent_dim: size of m, except for the last two.
         code_dim: numbers that the policy is told about a task, see :meth:`set_codes`.
+        infers: whether there is a second encoder, which reads sets of any behaviour.
         num_cells: widths of the hidden layers.
         latent_dim: size of the teachers' ``action_latent``; by default twice the action's.
 
@@ -79,6 +81,7 @@ class Student(nn.Module):
         num_cells: Sequence[int] = (256, 256),
         latent_dim: int | None = None,
         code_dim: int = 1,
+        infers: bool = False,
     ) -> None:
         super().__init__()
         dims = (observation_dim, action_dim)
@@ -100,6 +103,13 @@ class Student(nn.Module):
             )
         else:
             self.task_encoder = make_task_encoder(*dims, task_latent_dim, num_cells=num_cells)
+        self.context_encoder = (
+            make_context_encoder(
+                *dims, task_latent_dim, num_features=INFERENCE_FEATURES, num_cells=num_cells
+            )
+            if infers
+            else None
+        )
         self.task_classifier = make_task_classifier(num_tasks, task_latent_dim)
         self.generator = make_decoder(
             *dims, latent_dim, task_latent_dim=task_latent_dim, num_cells=num_cells
@@ -138,17 +148,15 @@ class Student(nn.Module):
             raise BMRLError(f"codes are of shape {tuple(table.shape)}; valid: {tuple(held.shape)}")
         held.copy_(table)
 
-    def set_step_scale(self, datasets: Sequence[TensorDictBase]) -> None:
-        """Tells an encoder of sets how far each number of the observation moves in a step.
+    def set_scales(self, *datasets: TensorDictBase) -> None:
+        """Tells the encoders of sets how large rewards and steps are.
 
         Args:
-            datasets: training transitions, ``[N_i]`` each.
+            *datasets: transitions of all tasks and behaviours, ``[N_i]`` each.
         """
-        steps = torch.cat([x["next", "observation"] - x["observation"] for x in datasets])
-        deviation = steps.double().std(0)
-        held = cast(Tensor, self.task_encoder.module.step_scale)
-        # A number that hardly moves carries rounding errors, which must not be enlarged.
-        held.copy_(torch.where(deviation > 1e-3, deviation, 1.0))
+        for encoder in (self.task_encoder, self.context_encoder):
+            if encoder is not None and reads_context(encoder):
+                cast(ContextNetwork, encoder.module).set_scales(*datasets)
 
     def check_embeds(self, what: str) -> None:
         """Checks that single transitions have an embedding.
@@ -177,6 +185,20 @@ class Student(nn.Module):
             BMRLError: as :func:`~torchrl_bmrl.modules.embed_context`.
         """
         return embed_context(self.task_encoder, context)
+
+    def infer(self, context: TensorDictBase) -> Tensor:
+        """Returns m of a set of transitions of any behaviour, ``(*B, task_latent_dim)``.
+
+        :meth:`embed_context` reads the task from what a demonstrator does. This reads it from
+        rewards and motion, if the student was trained with ``infers``; else it is the same.
+
+        Args:
+            context: normalised transitions, batch ``[*B, K]``.
+
+        Raises:
+            BMRLError: as :func:`~torchrl_bmrl.modules.embed_context`.
+        """
+        return embed_context(self.context_encoder or self.task_encoder, context)
 
     @torch.no_grad()
     def set_prototypes(self, datasets: Sequence[TensorDictBase], kind: str) -> None:
@@ -253,7 +275,7 @@ class Student(nn.Module):
         sets = reads_context(self.task_encoder)
         if source == "online":
             kind = ContextTaskLatent if sets else OnlineTaskLatent
-            return kind(self.prototypes[task], self.task_encoder)
+            return kind(self.prototypes[task], self.context_encoder or self.task_encoder)
         if source == "demonstration":
             assert demonstration is not None
             if sets:
@@ -303,6 +325,8 @@ def make_distillation_loss(
     )
 
 
+INFERENCE_FEATURES = 128
+"""Size of the embedding of one transition in the encoder of any behaviour."""
 LATENT_SOURCES = ("prototype", "online", "demonstration")
 OF_SETS = ("set_mean", "set_attention")
 TASK_ENCODERS = ("transition", *OF_SETS, "one_hot", "told", "nothing")

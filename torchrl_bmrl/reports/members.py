@@ -121,7 +121,10 @@ def explore_members(family: Family, members: Sequence[Member], *, note: str = ""
         "facts": [*family.parameters, "Member", "Return", "Success"],
         "tasks": [_task(member) for member in members],
         "note": f"There are no films: {note}" if note else "",
-        "episodes": [_episode(i, *points[i], member) for i, member in enumerate(members)],
+        "episodes": [
+            _episode(i, float(points[i][0]), float(points[i][1]), member)
+            for i, member in enumerate(members)
+        ],
     }
     dims = projection.strip().replace(
         ", its first two principal components",

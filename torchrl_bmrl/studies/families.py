@@ -311,7 +311,9 @@ def make_method(
         if method == "first":
             latent = first_latents(run, student, task, 0)
         else:
-            latent = student.embed_context(context(run, settings, task, method))
+            given = context(run, settings, task, method)
+            reads = student.embed_context if method == "demonstration" else student.infer
+            latent = reads(given)
     policy = student.policy(num_candidates=count, latent_clip=metadata["latent_clip"])
     return policy, latent
 

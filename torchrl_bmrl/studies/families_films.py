@@ -6,6 +6,7 @@ import base64
 from contextlib import closing
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tensordict.nn import TensorDictModuleBase
@@ -54,7 +55,7 @@ def film_once(
     """
 
     def make(path: Path) -> None:
-        states = []
+        states: list[Any] = []
 
         def watch(*_: object) -> None:
             if scene is not None:
