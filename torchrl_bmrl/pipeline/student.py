@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import re
 import reprlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -35,6 +33,7 @@ from torchrl_bmrl.modules import (
 from torchrl_bmrl.modules.context_encoder import ContextNetwork
 from torchrl_bmrl.objectives import MetaDistillationLoss
 from torchrl_bmrl.pipeline.agents import with_sizes
+from torchrl_bmrl.pipeline.metadata import are_statistics, is_number, is_task_name
 from torchrl_bmrl.training.checkpoint import build, load_checkpoint
 
 
@@ -364,15 +363,15 @@ def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
     number = len(student.prototypes)
     valid: dict[str, tuple[Callable[[Any], bool], str]] = {
         "tasks": (
-            lambda x: isinstance(x, list) and all(map(_is_task_name, x)) and len(set(x)) == number,
+            lambda x: isinstance(x, list) and all(map(is_task_name, x)) and len(set(x)) == number,
             f"{number} different names, one per prototype",
         ),
-        "latent_clip": (lambda x: x is None or (_is_number(x) and x > 0), "a number above 0, null"),
+        "latent_clip": (lambda x: x is None or (is_number(x) and x > 0), "a number above 0, null"),
         "accuracy": (
-            lambda x: x is None or (_is_number(x) and 0 <= x <= 1),
+            lambda x: x is None or (is_number(x) and 0 <= x <= 1),
             "a number between 0 and 1, or null without a classifier",
         ),
-        "statistics": (_are_statistics, "loc and scale, as many numbers in each, scale above 0"),
+        "statistics": (are_statistics, "loc and scale, as many numbers in each, scale above 0"),
     }
     for key, (holds, what) in valid.items():
         if not holds(metadata.get(key)):
@@ -380,31 +379,3 @@ def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
                 path, f"{key} is {reprlib.repr(metadata.get(key))}; valid: {what}"
             )
     return student, metadata
-
-
-def _is_number(x: Any) -> bool:
-    return isinstance(x, float | int) and math.isfinite(x)
-
-
-def _is_name(x: Any) -> bool:
-    return isinstance(x, str) and 0 < len(x) <= 200
-
-
-def _is_task_name(x: Any) -> bool:
-    """Whether a task's name can be part of a file name."""
-    return _is_name(x) and re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", x) is not None
-
-
-def _are_statistics(x: Any) -> bool:
-    if not isinstance(x, dict) or set(x) - {"parts"} != {"loc", "scale"}:
-        return False
-    parts = x.get("parts", [])
-    if not isinstance(parts, list) or not all(map(_is_name, parts)):
-        return False
-    lists = isinstance(x["loc"], list) and isinstance(x["scale"], list)
-    return (
-        lists
-        and len(x["loc"]) == len(x["scale"])
-        and all(map(_is_number, [*x["loc"], *x["scale"]]))
-        and all(scale > 0 for scale in x["scale"])
-    )
