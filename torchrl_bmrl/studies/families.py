@@ -183,6 +183,7 @@ def student_job(run: Run, settings: FamilySettings, method: str) -> StudentJob:
         "task_encoder": _OTHERS[method],
         "context": "current",
         "context_size": 1,
+        "inference_updates": 0,
         "isometry_weight": 0.0,
         "metric_weight": 0.0,
         "distance_weight": 0.0,
