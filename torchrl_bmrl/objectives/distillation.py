@@ -25,6 +25,7 @@ from torchrl_bmrl.objectives.student_terms import (
     arranging_errors,
     check_options,
     classify,
+    embedded,
     encoded_keys,
     isometry,
     reads_sets,
