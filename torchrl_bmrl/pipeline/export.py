@@ -26,8 +26,8 @@ log = logging.getLogger(__name__)
 CARD = """# The distilled policy of preset {preset}, seed {seed}
 
 One policy for {number} tasks ({tasks}), conditioned on a task embedding m of {dim} numbers.
-{parameters:,} parameters: the encoder of m{classifier}, the generator of actions and the critic that
-chooses among them. The file also contains a point of m for each task, the statistics that
+{parameters:,} parameters: the encoder of m{classifier}, the generator of actions and the critic
+that chooses among them. The file also contains a point of m for each task, the statistics that
 normalise observations, and one held-out demonstration of each task.
 
 ```bash
@@ -140,10 +140,11 @@ def _accuracy(student: Student, accuracy: float | None) -> str:
     """The card's paragraph on the classifier; empty without one."""
     if accuracy is None:
         return ""
-    of = "tasks, each from m of all its" if reads_context(student.task_encoder) else ""
-    named = f"{accuracy:.2%} of the {of or 'held-out transitions from m'}"
-    named = f"{named} held-out transitions" if of else named
-    return f"A linear layer names the task of {named}.\n\n"
+    if reads_context(student.task_encoder):
+        named = f"{accuracy:.2%} of the tasks from m of all held-out transitions of each"
+    else:
+        named = f"the task of {accuracy:.2%} of the held-out transitions from m"
+    return f"A linear layer names {named}.\n\n"
 
 
 def _write_onnx(run: Run, student: Student, metadata: dict[str, Any]) -> None:

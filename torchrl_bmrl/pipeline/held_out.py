@@ -81,7 +81,7 @@ def evaluate_held_out(run: Run) -> Table:
             (
                 run.titles[str(row["task"])],
                 *(f"{row[key]:.4g}" for key in ("loss_generator", "loss_qvalue", "distance")),
-                MISSING if isnan(row["accuracy"]) else f"{row['accuracy']:.1%}",
+                MISSING if isnan(float(row["accuracy"])) else f"{row['accuracy']:.1%}",
                 *(f"{row[key]:.2f}" for key in ("demonstrated", "bcq", "distilled")),
             )
             for row in rows
