@@ -36,35 +36,45 @@ class ContextNetwork(nn.Module):
 
     .. math:: m = \rho\Big(\sum_k w_k\, \phi(x_k)\Big),
         \quad w_k = 1/K \ \text{ or } \ \mathrm{softmax}_k\, \psi(x_k),
-        \quad x_k = (s_k, a_k, r_k, (s'_k - s_k) / \sigma)
+        \quad x_k = (s_k, a_k, (r_k - \mu) / \rho, (s'_k - s_k) / \sigma)
 
     Reference: Zaheer et al., *Deep Sets*, NeurIPS 2017, https://arxiv.org/abs/1703.06114; the
     attention is the pooling with one seed vector of Lee et al., *Set Transformer*, ICML 2019,
     https://arxiv.org/abs/1810.00825.
 
     Args:
-        transition_dim: size of a transition.
+        observation_dim: size of the observation.
+        action_dim: size of the action.
         task_latent_dim: size of m.
         pooling: ``"mean"`` or ``"attention"``.
         num_features: size of φ.
         num_cells: widths of the hidden layers of φ and ψ together, and of ρ.
+
+    Attributes:
         step_scale: σ, how far each number of the observation moves in a step, ``(obs_dim,)``. A
             step is much smaller than the spread of the observations that a network is made for.
+        reward_loc: μ, ``(1,)``.
+        reward_scale: ρ, ``(1,)``.
     """
 
     step_scale: Tensor
+    reward_loc: Tensor
+    reward_scale: Tensor
 
     def __init__(
         self,
-        transition_dim: int,
+        observation_dim: int,
+        action_dim: int,
         task_latent_dim: int,
         pooling: str,
         num_features: int,
         num_cells: Sequence[int],
-        step_scale: Tensor,
     ) -> None:
         super().__init__()
-        self.register_buffer("step_scale", step_scale.detach().clone())
+        self.register_buffer("step_scale", torch.ones(observation_dim))
+        self.register_buffer("reward_loc", torch.zeros(1))
+        self.register_buffer("reward_scale", torch.ones(1))
+        transition_dim = 2 * observation_dim + action_dim + 1
         self.attends = pooling == "attention"
         self.each = make_mlp(transition_dim, num_features + self.attends, num_cells)
         self.whole = make_mlp(num_features, task_latent_dim, num_cells[-1:])
@@ -74,7 +84,24 @@ class ContextNetwork(nn.Module):
     ) -> Tensor:
         """φ and, with attention, ψ of each transition, ``(*B, K, n)``."""
         step = (following - observation) / self.step_scale
+        reward = (reward - self.reward_loc) / self.reward_scale
         return self.each(torch.cat([observation, action, reward, step], -1))
+
+    @torch.no_grad()
+    def set_scales(self, *datasets: TensorDictBase) -> None:
+        """Sets the buffers, so that rewards and steps are as large as the rest of the input.
+
+        Args:
+            *datasets: transitions of all tasks and behaviours, ``[N_i]`` each.
+        """
+        steps = torch.cat([x["next", "observation"] - x["observation"] for x in datasets])
+        reward = torch.cat([x["next", "reward"] for x in datasets])
+        # A number that hardly moves carries rounding errors, which must not be enlarged.
+        deviation = steps.double().std(0)
+        self.step_scale.copy_(torch.where(deviation > 1e-3, deviation, 1.0))
+        self.reward_loc.copy_(reward.double().mean(0))
+        deviation = reward.double().std(0)
+        self.reward_scale.copy_(torch.where(deviation > 0, deviation, 1.0))
 
     def combine(self, features: Tensor, mask: Tensor) -> Tensor:
         """m of the transitions that count, ``(*B, m)``.
@@ -106,7 +133,6 @@ def make_context_encoder(
     pooling: str = "attention",
     num_features: int = 64,
     num_cells: Sequence[int] = (256, 256),
-    step_scale: Sequence[float] | Tensor | None = None,
 ) -> TensorDictModule:
     """Encoder :math:`M` of a set of transitions.
 
@@ -122,12 +148,9 @@ def make_context_encoder(
         pooling: ``"mean"``, or ``"attention"``: a weighted mean with learned weights.
         num_features: size of the embedding of one transition.
         num_cells: widths of the hidden layers.
-        step_scale: standard deviation of each number's change in a step, which the change is
-            divided by, ``(observation_dim,)``; ``None`` for 1.
 
     Raises:
         UnknownNameError: for another pooling.
-        BMRLError: for a ``step_scale`` of another size, or with a number that is not positive.
 
     Example:
         >>> encoder = make_context_encoder(3, 2, task_latent_dim=4)
@@ -138,14 +161,9 @@ def make_context_encoder(
     """
     if pooling not in POOLINGS:
         raise UnknownNameError("pooling", pooling, POOLINGS)
-    size = 2 * observation_dim + action_dim + 1
-    scale = torch.ones(observation_dim) if step_scale is None else torch.as_tensor(step_scale)
-    scale = scale.to(torch.get_default_dtype())
-    if scale.shape != (observation_dim,) or not (scale.isfinite() & (scale > 0)).all():
-        raise BMRLError(
-            f"step_scale is {scale.tolist()}; valid: {observation_dim} finite numbers above 0"
-        )
-    network = ContextNetwork(size, task_latent_dim, pooling, num_features, num_cells, scale)
+    network = ContextNetwork(
+        observation_dim, action_dim, task_latent_dim, pooling, num_features, num_cells
+    )
     sizes = {
         (CONTEXT, "observation"): observation_dim,
         (CONTEXT, "action"): action_dim,

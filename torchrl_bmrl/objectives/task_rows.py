@@ -55,3 +55,22 @@ def draw_others(task_latent: Tensor, valid: Tensor | None) -> tuple[Tensor, Tens
     task = (torch.arange(num_tasks, device=device).unsqueeze(-1) + shift) % num_tasks
     row = torch.randint(rows, (num_tasks, rows), device=device)
     return near, far[task, row]
+
+
+def draw_pairs(points: Tensor) -> tuple[Tensor, Tensor]:
+    """For each point another one of its task and one of every other task.
+
+    Args:
+        points: ``(num_tasks, C, m)``.
+
+    Returns:
+        ``(num_tasks, C, m)`` and ``(num_tasks, C, num_tasks - 1, m)``.
+    """
+    num_tasks, count, _ = points.shape
+    device = points.device
+    shift = torch.randint(1, max(count, 2), (count,), device=device)
+    near = points[:, (torch.arange(count, device=device) + shift) % count]
+    task = torch.arange(num_tasks, device=device).unsqueeze(-1)
+    others = (task + torch.arange(1, num_tasks, device=device)) % num_tasks
+    index = torch.randint(count, (num_tasks, count, num_tasks - 1), device=device)
+    return near, points[others.unsqueeze(1), index]

@@ -107,28 +107,32 @@ def tsne(
         return chosen, model.fit_transform(points)
 
 
-def plane(task_latent: NDArray[Any]) -> tuple[NDArray[np.float64], str]:
+def plane(
+    task_latent: NDArray[Any], of: NDArray[Any] | None = None
+) -> tuple[NDArray[np.float64], str]:
     """Projects embeddings to the plane.
 
     Args:
         task_latent: Embeddings m, shape ``(N, d)``; for d > 2 their first two principal components
             are taken.
+        of: Embeddings ``(K, d)`` whose principal components are taken instead.
 
     Returns:
         Points ``(N, 2)``, and a note for the title; it is empty for d = 2.
     """
     points = np.asarray(task_latent, dtype=np.float64)
+    fitted = points if of is None else np.asarray(of, dtype=np.float64)
     dim = points.shape[1]
     if dim == 2:
         return points, ""
     if dim == 1:
         return np.pad(points, ((0, 0), (0, 1))), "\n1-D, drawn on a line"
-    if is_one_point(points):  # it has no principal components
+    if is_one_point(fitted):  # it has no principal components
         return np.zeros((len(points), 2)), f"\n{dim}-D, all of it one point"
     with needs("reports"):
         from sklearn.decomposition import PCA
 
-    pca = PCA(n_components=2, svd_solver="full").fit(points)
+    pca = PCA(n_components=2, svd_solver="full").fit(fitted)
     share = pca.explained_variance_ratio_.sum()
     note = f"\n{dim}-D, its first two principal components ({share:.0%} of the variance)"
     return pca.transform(points), note

@@ -1,4 +1,5 @@
-// The embedding explorer: points of held-out episodes; one episode is chosen and played.
+// The embedding explorer: points of episodes; one episode is chosen and played. A point is a moment
+// of its episode or, if data.still, the whole episode, which a click plays.
 // All text from data is set as textContent, never as markup.
 (() => {
   "use strict";
@@ -9,11 +10,10 @@
   const canvas = part("canvas");
   const context = canvas.getContext("2d");
   const slider = part("slider");
+  // Only a family's members have parameters, which colour them, groups and facts.
+  const { still = false, parameters = [], groups = [], facts = [] } = data;
 
-  const MARGIN = { left: 64, right: 14, top: 12, bottom: 50 }; // room for the axes [px]
   const REACH = 14; // a point answers to a pointer this near [px]
-  const VIRIDIS = ["#440154", "#3b528b", "#21918c", "#5ec962", "#fde725"];
-  const FONT = '13px system-ui, "Segoe UI", Roboto, sans-serif';
 
   // The selection. A point is an episode (its index in data.episodes) and one of its rows.
   const state = { task: -1, episode: 0, row: 0, hovered: null, playing: false };
@@ -36,23 +36,17 @@
 
   function color(episode, row) {
     const coloring = part("coloring").value;
+    const parameter = parameters[coloring];
+    if (parameter) {
+      const { scale, low, high, values } = parameter;
+      return shade(scale, (values[episode.task] - low) / (high - low || 1));
+    }
     if (coloring === "phase") return data.phases[episode.phase[row]].color;
     if (coloring === "distance") {
       const distance = episode.distance[row];
-      return distance === null ? "#b0b4ba" : viridis(distance / farthest);
+      return distance === null ? "#b0b4ba" : shade(VIRIDIS, distance / farthest);
     }
     return data.tasks[episode.task].color;
-  }
-
-  function viridis(share) {
-    const place = Math.min(Math.max(share, 0), 1) * (VIRIDIS.length - 1);
-    const index = Math.min(Math.floor(place), VIRIDIS.length - 2);
-    const channel = (hex, i) => parseInt(hex.slice(1 + 2 * i, 3 + 2 * i), 16);
-    const mix = [0, 1, 2].map((i) => {
-      const [a, b] = [channel(VIRIDIS[index], i), channel(VIRIDIS[index + 1], i)];
-      return Math.round(a + (place - index) * (b - a));
-    });
-    return `rgb(${mix.join(",")})`;
   }
 
   // The last picture taken at or before a row, as [step, base64].
@@ -92,72 +86,26 @@
     };
   }
 
-  function ticks(low, high) {
-    const rough = (high - low) / 8;
-    const power = 10 ** Math.floor(Math.log10(rough));
-    const step = [1, 2, 5, 10].map((k) => k * power).find((s) => s >= rough);
-    const digits = Math.max(0, -Math.floor(Math.log10(step)));
-    const values = [];
-    for (let k = Math.ceil(low / step); k * step <= high; k += 1) values.push(k * step);
-    return values.map((value) => [value, value.toFixed(digits).replace("-", "−")]);
-  }
-
-  function drawAxes(pen) {
-    const [left, top] = [MARGIN.left, MARGIN.top];
-    const [right, bottom] = [left + view.width, top + view.height];
-    pen.font = FONT;
-    pen.fillStyle = "#1d2129";
-    pen.lineWidth = 1;
-    const line = (stroke, ...points) => {
-      pen.strokeStyle = stroke;
-      pen.beginPath();
-      points.forEach(([x, y]) => pen.lineTo(x, y));
-      pen.stroke();
-    };
-    pen.textAlign = "center";
-    for (const [value, label] of ticks(view.low[0], view.high[0])) {
-      line("#e6e6e6", [view.x(value), top], [view.x(value), bottom]);
-      pen.fillText(label, view.x(value), bottom + 18);
-    }
-    pen.textAlign = "right";
-    for (const [value, label] of ticks(view.low[1], view.high[1])) {
-      line("#e6e6e6", [left, view.y(value)], [right, view.y(value)]);
-      pen.fillText(label, left - 8, view.y(value) + 4);
-    }
-    line("#1d2129", [left, top], [left, bottom], [right, bottom]);
-    pen.textAlign = "center";
-    pen.fillText(data.axes[0], left + view.width / 2, bottom + 42);
-    pen.save();
-    pen.translate(15, top + view.height / 2);
-    pen.rotate(-Math.PI / 2);
-    pen.fillText(data.axes[1], 0, 0);
-    pen.restore();
-  }
-
   function drawBackground() {
     background = document.createElement("canvas");
     [background.width, background.height] = [canvas.width, canvas.height];
     const pen = background.getContext("2d");
     pen.setTransform(view.ratio, 0, 0, view.ratio, 0, 0);
-    const points = shown().flatMap((e) => e.x.map((_, row) => [e, row]));
+    const rowsOf = (e) => (still ? [0] : e.x.map((_, row) => row));
+    const points = shown().flatMap((e) => rowsOf(e).map((row) => [e, row]));
     // In a mixed order, the same each time, no task hides the others where they overlap.
     const stride = [7919, 7907, 7901].find((prime) => points.length % prime) || 1;
-    const radius = points.length > 2000 ? 2.2 : 3;
+    const radius = still ? 6 : points.length > 2000 ? 2.2 : 3;
+    const edge = still && "#1d2129"; // light colours need it on white
     for (let i = 0; i < points.length; i += 1) {
       const [episode, row] = points[(i * stride) % points.length];
-      dot(pen, episode, row, radius, color(episode, row));
+      dot(pen, episode, row, radius, color(episode, row), edge, 1);
     }
   }
 
-  function dot(pen, episode, row, radius, fill, edge) {
-    pen.beginPath();
-    pen.arc(view.x(episode.x[row]), view.y(episode.y[row]), radius, 0, 2 * Math.PI);
-    pen.fillStyle = fill;
-    pen.fill();
-    if (!edge) return;
-    pen.strokeStyle = edge;
-    pen.lineWidth = 2;
-    pen.stroke();
+  function dot(pen, episode, row, radius, fill, edge, width = 2) {
+    const mark = groups.length ? groups[data.tasks[episode.task].group].mark : "circle";
+    drawMark(pen, view.x(episode.x[row]), view.y(episode.y[row]), radius, mark, fill, edge, width);
   }
 
   function line(episode, first, last, stroke, width) {
@@ -174,21 +122,22 @@
     context.setTransform(1, 0, 0, 1, 0, 0);
     context.clearRect(0, 0, canvas.width, canvas.height);
     context.setTransform(view.ratio, 0, 0, view.ratio, 0, 0);
-    drawAxes(context);
+    drawAxes(context, view, data.axes);
     context.setTransform(1, 0, 0, 1, 0, 0);
-    context.globalAlpha = 0.5; // so that the chosen episode stands out
+    context.globalAlpha = still ? 1 : 0.5; // so that the chosen episode stands out
     context.drawImage(background, 0, 0);
     context.globalAlpha = 1;
     context.setTransform(view.ratio, 0, 0, view.ratio, 0, 0);
     const chosen = data.episodes[state.episode];
-    chosen.x.forEach((_, row) => dot(context, chosen, row, 3, color(chosen, row)));
+    if (!still) chosen.x.forEach((_, row) => dot(context, chosen, row, 3, color(chosen, row)));
     // The whole episode faintly, because it may be a tangle; its last ten steps clearly.
     line(chosen, 0, chosen.x.length - 1, "rgba(29, 33, 41, 0.3)", 0.8);
     line(chosen, Math.max(0, state.row - 10), state.row, "#1d2129", 2);
-    dot(context, chosen, state.row, 7, color(chosen, state.row), "#000");
+    dot(context, chosen, state.row, still ? 9 : 7, color(chosen, state.row), "#000");
     if (!state.hovered) return;
-    const [episode, row] = state.hovered;
-    dot(context, data.episodes[episode], row, 6, "#fff", "#000");
+    const [index, row] = state.hovered;
+    const hovered = data.episodes[index];
+    dot(context, hovered, row, still ? 8 : 6, still ? color(hovered, row) : "#fff", "#000");
   }
 
   function drawLegend() {
@@ -202,6 +151,12 @@
       legend.append(item);
     };
     const coloring = part("coloring").value;
+    groups.forEach(({ name, mark }) => entry(name, "#1d2129", `swatch ${mark}`));
+    const parameter = parameters[coloring];
+    if (parameter) {
+      entry(parameter.legend, `linear-gradient(90deg, ${parameter.scale.join(", ")})`, "ramp");
+      return;
+    }
     if (coloring === "distance") {
       const ramp = `linear-gradient(90deg, ${VIRIDIS.join(", ")})`;
       entry(`distance to goal: 0 to ${farthest.toFixed(2)} m`, ramp, "ramp");
@@ -221,12 +176,15 @@
     const time = timeOf(episode, row);
     const say = (name, text) => { part(`show-${name}`).textContent = text; };
     say("task", task);
-    say("episode", `${episode.number} of ${episode.of}`);
+    facts.forEach((_, i) => say(`fact-${i}`, data.tasks[episode.task].facts[i]));
     const period = data.tasks[episode.task].period;
     say("time", period ? `${time} (step ${episode.step[row]})` : time);
-    say("phase", data.phases[episode.phase[row]].name);
-    say("distance", meters(episode.distance[row]));
-    say("success", episode.success[row] === null ? "–" : episode.success[row] ? "yes" : "no");
+    if (!still) {
+      say("episode", `${episode.number} of ${episode.of}`);
+      say("phase", data.phases[episode.phase[row]].name);
+      say("distance", meters(episode.distance[row]));
+      say("success", episode.success[row] === null ? "–" : episode.success[row] ? "yes" : "no");
+    }
     const signed = (value) => value.toPrecision(3).replace("-", "−");
     say("point", `(${signed(episode.x[row])}, ${signed(episode.y[row])})`);
     part("which").textContent = state.hovered ? "Under the pointer" : "Chosen point";
@@ -239,7 +197,7 @@
       const source = `data:image/webp;base64,${frame[1]}`;
       if (picture.src !== source) picture.src = source;
       const at = timeOf({ task: episode.task, step: [frame[0]] }, 0);
-      picture.alt = `${task}, episode ${episode.number}, at ${at}`;
+      picture.alt = `${still ? task : `${task}, episode ${episode.number}`}, at ${at}`;
     } else {
       part("noframe").textContent = data.note || "No pictures were made of this episode.";
     }
@@ -278,7 +236,8 @@
     const options = data.episodes.flatMap((e, i) => {
       if (state.task >= 0 && e.task !== state.task) return [];
       const film = hasFrames(e) ? " (film)" : "";
-      return [option(`${data.tasks[e.task].name} ${e.number}${film}`, i)];
+      const number = still ? "" : ` ${e.number}`;
+      return [option(`${data.tasks[e.task].name}${number}${film}`, i)];
     });
     part("episode").replaceChildren(...options);
   }
@@ -361,6 +320,8 @@
   canvas.addEventListener("mousemove", (event) => {
     state.hovered = nearest(event);
     canvas.style.cursor = state.hovered ? "pointer" : "default";
+    // The pointer stays on the point that it clicked, whose film plays.
+    if (still && state.hovered && state.hovered[0] === state.episode) state.hovered = null;
     refresh();
   });
   canvas.addEventListener("mouseleave", () => {
@@ -372,13 +333,30 @@
     if (!found) return;
     stop();
     choose(...found);
+    if (still) play();
   });
 
   part("task").append(option("All tasks", -1));
   data.tasks.forEach((task, i) => {
     if (data.episodes.some((e) => e.task === i)) part("task").append(option(task.name, i));
   });
-  if (!measured) part("coloring").querySelector('[value="distance"]').remove();
+  if (still) {
+    part("task").parentElement.hidden = true;
+    part("episode").parentElement.firstChild.textContent = "Task ";
+    part("coloring").replaceChildren(...parameters.map(({ name }, i) => option(name, i)));
+    for (const name of ["episode", "phase", "distance", "success"]) {
+      const value = part(`show-${name}`);
+      value.previousElementSibling.remove();
+      value.remove();
+    }
+    facts.forEach((fact, i) => {
+      const [name, value] = [document.createElement("dt"), document.createElement("dd")];
+      name.textContent = fact;
+      value.dataset.part = `show-fact-${i}`;
+      part("show-time").previousElementSibling.before(name, value);
+    });
+  }
+  if (!measured && !still) part("coloring").querySelector('[value="distance"]').remove();
   canvas.setAttribute("aria-label", data.description);
   chooseTask(-1);
   new ResizeObserver(redraw).observe(canvas);

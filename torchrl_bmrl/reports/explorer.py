@@ -6,6 +6,7 @@ import base64
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from html import escape
 from importlib.resources import files
 from typing import Any
 
@@ -93,13 +94,7 @@ class Explorer:
 
     def html(self) -> str:
         """Returns the explorer as HTML: markup, data and script; all text from data is escaped."""
-        # In JSON "<" occurs only in text. Escaped, no text can end the script element.
-        content = json.dumps(self._content(), allow_nan=False).replace("<", "\\u003c")
-        return (
-            f"{_file('explorer.html')}"
-            f'<script type="application/json">{content}</script>\n'
-            f"<script>\n{_file('explorer.js')}</script>\n</div>"
-        )
+        return StoredExplorer(content=self._content()).html()
 
     def _content(self) -> dict[str, Any]:
         """Returns the data that the script reads."""
@@ -166,6 +161,35 @@ class Explorer:
         elif self.note:
             text.append(f"There are no films: {self.note}")
         return text
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredExplorer:
+    """An explorer as its data: what the script reads, from a file or made elsewhere.
+
+    Args:
+        content: JSON-compatible data of ``explorer.js``.
+        caption: Caption below it.
+
+    Example:
+        >>> StoredExplorer(content={"tasks": []}, caption="m < 1").html().count("m &lt; 1")
+        1
+    """
+
+    content: Mapping[str, Any]
+    caption: str = ""
+
+    def html(self) -> str:
+        """Returns the explorer as HTML: markup, data and script; all text from data is escaped."""
+        # In JSON "<" occurs only in text. Escaped, no text can end the script element.
+        content = json.dumps(self.content, allow_nan=False).replace("<", "\\u003c")
+        script = f"(() => {{\n{_file('explorer_marks.js')}\n{_file('explorer.js')}}})();\n"
+        caption = f'<p class="caption">{escape(self.caption)}</p>\n' if self.caption else ""
+        return (
+            f"{_file('explorer.html')}"
+            f'<script type="application/json">{content}</script>\n'
+            f"<script>\n{script}</script>\n{caption}</div>"
+        )
 
 
 def style() -> str:

@@ -93,7 +93,7 @@ def explore_demonstrations(
     try:
         for when, pictures in zip(moments, _render(scenes), strict=True):
             frames |= {
-                moment: _webp(picture) for moment, picture in zip(when, pictures, strict=True)
+                moment: webp(picture) for moment, picture in zip(when, pictures, strict=True)
             }
     except RenderError as error:
         note = f"{error}."
@@ -124,7 +124,8 @@ def _render(scenes: list[tuple[str, NDArray[Any]]]) -> list[NDArray[np.uint8]]:
     return pictures
 
 
-def _webp(picture: NDArray[np.uint8]) -> bytes:
+def webp(picture: NDArray[np.uint8]) -> bytes:
+    """Compresses a picture ``(height, width, 3)``."""
     with needs("reports"):
         from PIL import Image
 

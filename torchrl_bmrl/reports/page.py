@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import write_atomic
-from torchrl_bmrl.reports.explorer import Explorer, style
+from torchrl_bmrl.reports.explorer import Explorer, StoredExplorer, style
 from torchrl_bmrl.reports.tables import Table
 
 with needs("reports"):
@@ -127,7 +127,7 @@ class Section:
     heading: str
     paragraphs: Sequence[str] = ()
     tables: Sequence[Table] = ()
-    explorer: Explorer | None = None
+    explorer: Explorer | StoredExplorer | None = None
     pictures: Sequence[Picture] = ()
 
 

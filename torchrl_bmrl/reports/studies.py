@@ -10,6 +10,7 @@ from pathlib import Path
 
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.files import read_json, write_atomic
+from torchrl_bmrl.reports.explorer import StoredExplorer
 from torchrl_bmrl.reports.page import Picture, Section
 from torchrl_bmrl.reports.tables import Table
 
@@ -19,13 +20,14 @@ def write_study(
 ) -> None:
     """Saves a study's part of the page in a run folder.
 
-    It writes ``tables/<name>.{md,csv}``, ``figures/<figure>.png`` and, last,
-    ``studies/<name>.json``, which the report reads. Each file is written atomically.
+    It writes ``tables/<name>.{md,csv}``, ``figures/<figure>.png``, ``figures/<name>.json`` with the
+    explorer's data and, last, ``studies/<name>.json``, which the report reads. Each file is written
+    atomically.
 
     Args:
         run_dir: Run folder.
         name: Name of the study and of its files.
-        section: Heading, text and one table.
+        section: Heading, text, one table and, if there is one, a stored explorer.
         figures: Pictures by file name.
 
     Example:
@@ -42,8 +44,12 @@ def write_study(
     write_atomic(run_dir / "tables" / f"{name}.csv", table.csv())
     for figure, picture in figures.items():
         write_atomic(run_dir / "figures" / f"{figure}.png", picture.png)
+    if isinstance(section.explorer, StoredExplorer):
+        data = json.dumps(asdict(section.explorer), allow_nan=False)
+        write_atomic(run_dir / "figures" / f"{name}.json", data + "\n")
     content = {
         "heading": section.heading,
+        "explorer": section.explorer is not None,
         "paragraphs": list(section.paragraphs),
         "table": asdict(table),
         "pictures": [
@@ -75,8 +81,13 @@ def _read(path: Path) -> Section:
             )
             for picture in content["pictures"]
         ]
+        explorer = None
+        if content.get("explorer"):  # studies of earlier versions say nothing of it
+            figure = path.parents[1] / "figures" / path.name
+            explorer = StoredExplorer(**json.loads(figure.read_text(encoding="utf-8")))
         return Section(
             heading=content["heading"],
+            explorer=explorer,
             paragraphs=content["paragraphs"],
             tables=[Table(**content["table"])],
             pictures=pictures,

@@ -33,9 +33,12 @@ from torchrl_bmrl.pipeline.stage2 import StudentJob, train_student
 from torchrl_bmrl.pipeline.student import Student, load_student
 from torchrl_bmrl.pipeline.task_files import with_run_options
 from torchrl_bmrl.reports import Section, write_study
+from torchrl_bmrl.reports.explorer import StoredExplorer
+from torchrl_bmrl.reports.members import Member, explore_members
 from torchrl_bmrl.run.folder import open_run
 from torchrl_bmrl.run.settings import check_settings, setting
 from torchrl_bmrl.run.workers import Report
+from torchrl_bmrl.studies.families_films import film_once, why_no_films
 from torchrl_bmrl.studies.families_line import LINES, POINTS, line_table, lines_of, play_line
 from torchrl_bmrl.studies.families_report import make_table
 from torchrl_bmrl.studies.imitation import clone_behaviour
@@ -87,8 +90,8 @@ def generalise(run: Run, settings: FamilySettings) -> str:
     """Plays the held-out members of the run's family with every method.
 
     Trains the students of the comparison first, and also plays points between trained members.
-    Writes ``families/results.csv`` and ``families/lines.csv`` with a table each. Students and
-    episodes that are there already are read back.
+    Writes ``families/results.csv`` and ``families/lines.csv`` with a table each, and the members in
+    the embedding for the page. Students and episodes that are there already are read back.
 
     Args:
         run: an open run with stage 2, whose tasks are the trained members of a family.
@@ -130,7 +133,8 @@ def generalise(run: Run, settings: FamilySettings) -> str:
     rows = [row for part in results for row in part]
     write_rows(run.folder / settings.folder / "results.csv", rows)
     table = make_table(family.title, {name: METHODS[name] for name in methods}, rows)
-    section = Section(heading="Tasks that nobody trained on", tables=[table])
+    heading, explorer = "Tasks that nobody trained on", explore(run, settings)
+    section = Section(heading=heading, tables=[table], explorer=explorer)
     write_study(run.folder, "families", section, {})
     if family.measure is None or "one_hot" not in methods:
         return table.markdown()
@@ -190,6 +194,43 @@ def student_job(run: Run, settings: FamilySettings, method: str) -> StudentJob:
     check_settings(distill, f"families.students.{method}.")
     distill.check(["prototype"])
     return StudentJob(distill, f"{settings.folder}/{method}")
+
+
+def explore(run: Run, settings: FamilySettings) -> StoredExplorer:
+    """All members in the embedding, each with a film if films can be made.
+
+    Args:
+        run: the run.
+        settings: of the study.
+    """
+    note, family = why_no_films(), run.family
+    members = [("train", task) for task in run.tasks]
+    members += [(split, task) for split in HELD_OUT for task in family.tasks(split)]
+    found = run.jobs(
+        look_at_member,
+        [(settings, split, task, not note) for split, task in members],
+        total=0 if note else sum(run.horizon(task) for _, task in members),
+        description="filming members",
+        unit="step",
+    )
+    if not note and not any(member.film and member.film.frames for member in found):
+        note = "the environments of these tasks make no pictures."
+    return explore_members(family, found, note=note)
+
+
+def look_at_member(
+    job: tuple[Run, tuple[FamilySettings, str, Task, bool]], report: Report
+) -> Member:
+    """m of a member's demonstration and, if wanted, an episode that is played with it."""
+    run, (settings, split, task, filmed) = job
+    policy, latent = make_method(run, settings, task, "demonstration")
+    return Member(
+        title=task.title,
+        split=split,
+        parameter=run.family.parameter(task.name),
+        task_latent=latent.numpy(),
+        film=film_once(run, settings.folder, task, policy, latent, report) if filmed else None,
+    )
 
 
 Job = tuple[FamilySettings, str, Task]
@@ -270,7 +311,9 @@ def make_method(
         if method == "first":
             latent = first_latents(run, student, task, 0)
         else:
-            latent = student.embed_context(context(run, settings, task, method))
+            given = context(run, settings, task, method)
+            reads = student.embed_context if method == "demonstration" else student.infer
+            latent = reads(given)
     policy = student.policy(num_candidates=count, latent_clip=metadata["latent_clip"])
     return policy, latent
 
