@@ -8,10 +8,12 @@ from typing import Any
 
 
 def is_number(x: Any) -> bool:
+    """Whether it is a finite number."""
     return isinstance(x, float | int) and math.isfinite(x)
 
 
 def is_name(x: Any) -> bool:
+    """Whether it is a text that a page can show."""
     return isinstance(x, str) and 0 < len(x) <= 200
 
 
@@ -21,6 +23,7 @@ def is_task_name(x: Any) -> bool:
 
 
 def are_statistics(x: Any) -> bool:
+    """Whether they are an observation's mean and scale."""
     if not isinstance(x, dict) or set(x) - {"parts"} != {"loc", "scale"}:
         return False
     parts = x.get("parts", [])
