@@ -37,10 +37,11 @@ each_pooling = pytest.mark.parametrize("pooling", POOLINGS)
 
 def make_encoder(pooling: str = "attention", dtype: torch.dtype = torch.float64) -> Any:
     torch.manual_seed(0)
-    scale = [0.5, 2.0, 1.0]
-    return make_context_encoder(
-        *DIMS, SIZE, pooling=pooling, num_features=6, num_cells=CELLS, step_scale=scale
-    ).to(dtype)
+    encoder = make_context_encoder(*DIMS, SIZE, pooling=pooling, num_features=6, num_cells=CELLS)
+    encoder.module.step_scale.copy_(torch.tensor([0.5, 2.0, 1.0]))
+    encoder.module.reward_loc.fill_(3.0)
+    encoder.module.reward_scale.fill_(0.2)
+    return encoder.to(dtype)
 
 
 def some(*batch: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> TensorDict:
@@ -62,7 +63,8 @@ def test_it_is_the_formula(pooling: str) -> None:
     embedded = []
     for row in data:
         step = (row["next", "observation"] - row["observation"]) / torch.tensor([0.5, 2.0, 1.0])
-        x = torch.cat([row["observation"], row["action"], row["next", "reward"], step])
+        reward = (row["next", "reward"] - 3) / torch.tensor(0.2).double()  # 0.2 in float32
+        x = torch.cat([row["observation"], row["action"], reward, step])
         embedded.append(network.each(x))
     if pooling == "attention":
         raw = [math.exp(x[-1].item()) for x in embedded]
@@ -189,10 +191,31 @@ def test_another_pooling_is_refused() -> None:
         make_context_encoder(*DIMS, pooling="max")
 
 
-@pytest.mark.parametrize("scale", [[1.0], [1.0, 0.0, 1.0], [1.0, float("nan"), 1.0], 2.0])
-def test_a_step_scale_that_does_not_fit_is_refused(scale: Any) -> None:
-    with pytest.raises(BMRLError, match=r"step_scale is .*valid: 3 finite numbers above 0"):
-        make_context_encoder(*DIMS, step_scale=scale)
+def test_scales_are_those_of_all_data_together() -> None:
+    first, second = some(40), some(30, seed=1)
+    second["next", "reward"] *= 5
+    for data in (first, second):
+        data["next", "observation"][:, 2] = data["observation"][:, 2] + 1e-5 * torch.rand(len(data))
+    network = make_encoder().module
+    network.set_scales(first, second)
+    steps = [x["next", "observation"] - x["observation"] for x in (first, second)]
+    expected = torch.cat(steps).std(0)
+    expected[2] = 1  # a number that hardly moves is not enlarged
+    torch.testing.assert_close(network.step_scale, expected)
+    reward = torch.cat([x["next", "reward"] for x in (first, second)])
+    torch.testing.assert_close(network.reward_loc, reward.mean(0))
+    torch.testing.assert_close(network.reward_scale, reward.std(0))
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_scales_of_rewards_and_states_that_never_change_are_one(count: int) -> None:
+    still = some(1).expand(count).clone()
+    still["next", "observation"] = still["observation"]
+    network = make_encoder().module
+    network.set_scales(still)
+    assert network.step_scale.tolist() == [1.0] * 3
+    assert network.reward_scale.tolist() == [1.0]
+    assert m(make_encoder(), still).isfinite().all()
 
 
 @pytest.mark.parametrize(
