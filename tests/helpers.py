@@ -241,22 +241,40 @@ def distillation_networks(num_tasks: int = TASKS, teachers: Any = None) -> dict[
     return dict(zip(names, student, strict=True)) | frozen
 
 
+def set_networks(pooling: str = "attention", num_tasks: int = TASKS) -> dict[str, Any]:
+    """A student whose encoder reads sets of transitions, and its teachers."""
+    encoder = make_context_encoder(
+        *DIMS, TASK_LATENT_DIM, pooling=pooling, num_features=6, num_cells=CELLS
+    )
+    return distillation_networks(num_tasks) | {M: encoder.to(torch.float64)}
+
+
+def set_transitions(*shape: int, dtype: torch.dtype = torch.float64) -> TensorDict:
+    """Random transitions of several tasks, each with one of a context of its task."""
+    data = task_transitions(*shape, dtype=dtype)
+    given = transitions(*shape, dtype=dtype, seed=2)
+    return data.set("context", given.select("observation", "action", "next"))
+
+
 def distillation_case(
     trains: dict[str, set[str]] = STUDENT,
     *,
     num_tasks: int = TASKS,
     teachers: Any = None,
+    sets: bool = False,
     **options: Any,
 ) -> Case:
+    if sets:
+        options = {"context_fraction": 1.0, "context_size": 2, **options}
     return Case(
         MetaDistillationLoss,
-        partial(distillation_networks, num_tasks, teachers),
+        set_networks if sets else partial(distillation_networks, num_tasks, teachers),
         trains,
         options={"latent_dim": LATENT_DIM, "context": "current", **options},
-        data=task_transitions,
+        data=set_transitions if sets else task_transitions,
         shape=(TASKS, ROWS),
         need_not_fall=("latent_norm",),  # the penalty on m pays for the other terms
-        mixes_rows=options.get("context") in ("random", "set"),
+        mixes_rows=options.get("context") in ("random", "set", "given"),
     )
 
 

@@ -66,6 +66,9 @@ STUDENTS = {
     "distillation_metric": distillation_case(
         STUDENT | {"metric": {M}}, context="set", metric_weight=0.5
     ),
+    "distillation_of_sets": distillation_case(
+        STUDENT | {"distance": {M}}, sets=True, context="set", distance_weight=0.5
+    ),
 }
 RELABELLING = {"mbml": mbml_case(), "reward_models": reward_models_case()}
 CASES = OFFLINE | STUDENTS | RELABELLING
@@ -87,6 +90,11 @@ class TestStudents(KeyedLossContract):
     def test_a_loss_without_targets_refuses_an_updater(self, case: Case) -> None:
         with pytest.raises(RuntimeError, match="target"):
             SoftUpdate(case.make(), tau=0.1)
+
+    def test_renamed_and_nested_keys_give_the_same_losses(self, case: Case) -> None:
+        if case is CASES["distillation_of_sets"]:
+            pytest.skip("its encoder has names of its own, see tests/test_distillation_sets.py")
+        super().test_renamed_and_nested_keys_give_the_same_losses(case)
 
     def test_value_estimators_are_refused(self, case: Case) -> None:
         with pytest.raises(NotImplementedError):

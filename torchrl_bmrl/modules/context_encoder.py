@@ -96,11 +96,12 @@ class ContextNetwork(nn.Module):
         """
         steps = torch.cat([x["next", "observation"] - x["observation"] for x in datasets])
         reward = torch.cat([x["next", "reward"] for x in datasets])
+        several = int(len(steps) > 1)  # one transition has no deviation
         # A number that hardly moves carries rounding errors, which must not be enlarged.
-        deviation = steps.double().std(0)
+        deviation = steps.double().std(0, correction=several)
         self.step_scale.copy_(torch.where(deviation > 1e-3, deviation, 1.0))
         self.reward_loc.copy_(reward.double().mean(0))
-        deviation = reward.double().std(0)
+        deviation = reward.double().std(0, correction=several)
         self.reward_scale.copy_(torch.where(deviation > 0, deviation, 1.0))
 
     def combine(self, features: Tensor, mask: Tensor) -> Tensor:

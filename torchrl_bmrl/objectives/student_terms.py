@@ -185,7 +185,12 @@ def embed_sets(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> Embedd
     inner = [unravel_key(key[1:]) for key in loss.task_encoder.in_keys if key[1:] != ("mask",)]
     rows = loss._entries(tensordict, inner, under=CONTEXT if given else ())
     contexts, own, filled = group_rows(rows, loss.context_size, valid)
-    points = loss._run("task_encoder", contexts, loss.tensor_keys.task_latent)
+    try:
+        points = loss._run("task_encoder", contexts, loss.tensor_keys.task_latent)
+    except BMRLError as error:  # it names the groups, and the caller knows the rows
+        under = CONTEXT if given else ()
+        shapes = [f"{unravel_key((under, key))!r} {tuple(rows.get(key).shape)}" for key in inner]
+        raise BMRLError(f"rows of {', '.join(shapes)} make no contexts: {error}") from error
     if filled is not None:
         number = torch.arange(points.shape[1], device=points.device)
         valid = number < filled.unsqueeze(-1)

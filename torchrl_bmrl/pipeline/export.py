@@ -140,10 +140,11 @@ def _accuracy(student: Student, accuracy: float | None) -> str:
     """The card's paragraph on the classifier; empty without one."""
     if accuracy is None:
         return ""
-    of = "tasks, each from m of all its" if reads_context(student.task_encoder) else ""
-    named = f"{accuracy:.2%} of the {of or 'held-out transitions from m'}"
-    named = f"{named} held-out transitions" if of else named
-    return f"A linear layer names the task of {named}.\n\n"
+    if reads_context(student.task_encoder):
+        named = f"{accuracy:.2%} of the tasks from m of all held-out transitions of each"
+    else:
+        named = f"the task of {accuracy:.2%} of the held-out transitions from m"
+    return f"A linear layer names {named}.\n\n"
 
 
 def _write_onnx(run: Run, student: Student, metadata: dict[str, Any]) -> None:

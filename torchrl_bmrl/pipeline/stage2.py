@@ -239,7 +239,8 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
         nonlocal inference
         if number > distill.updates:
             if inference is None:
-                student.set_prototypes(train, distill.prototype)
+                here = [data.to(settings.device) for data in train]
+                student.set_prototypes(here, distill.prototype)
                 inference = Inference(student, optimizers["inference"], distill, train, others)
             return inference.step(number - distill.updates)
         if distill.cosine:

@@ -82,8 +82,6 @@ class FamilySettings:
 
 _OTHERS: dict[str, str] = {"told": "told", "one_hot": "one_hot", "no_context": "nothing"}
 """Encoders of the students that are trained for the comparison, by method."""
-_OF_CONTEXTS = {"demonstration", "behaviour", "one_shot"}
-"""Methods whose m is that of a context."""
 
 
 def generalise(run: Run, settings: FamilySettings) -> str:
@@ -107,7 +105,7 @@ def generalise(run: Run, settings: FamilySettings) -> str:
     family, methods = run.family, settings.methods
     run.check_playable()
     student, _ = run.student()  # a missing policy is an error before anything is written
-    if set(methods) & _OF_CONTEXTS and not reads_context(student.task_encoder):
+    if not reads_context(student.task_encoder):
         check_reads_transitions(student.task_encoder)
     if "behaviour" in methods and not run.settings.collect.context_episodes:
         raise ConfigError(
@@ -122,11 +120,7 @@ def generalise(run: Run, settings: FamilySettings) -> str:
         description="training the students of the comparison",
         unit="update",
     )
-    members = [
-        (split, with_run_options(task, run.settings))
-        for split in HELD_OUT
-        for task in family.tasks(split)
-    ]
+    members = held_out_members(run)
     steps = sum(run.horizon(task) for _, task in members) * settings.episodes * len(methods)
     jobs = [(settings, split, task) for split, task in members]
     results = run.jobs(play_member, jobs, total=steps, description="playing", unit="step")
@@ -159,6 +153,19 @@ def generalise(run: Run, settings: FamilySettings) -> str:
         {},
     )
     return f"{table.markdown()}\n{second.markdown()}"
+
+
+def held_out_members(run: Run) -> list[tuple[str, Task]]:
+    """Split and task of each held-out member, with the run's robot and stepper.
+
+    Args:
+        run: the run.
+    """
+    return [
+        (split, with_run_options(task, run.settings))
+        for split in HELD_OUT
+        for task in run.family.tasks(split)
+    ]
 
 
 def student_job(run: Run, settings: FamilySettings, method: str) -> StudentJob:
@@ -205,8 +212,7 @@ def explore(run: Run, settings: FamilySettings) -> StoredExplorer:
         settings: of the study.
     """
     note, family = why_no_films(), run.family
-    members = [("train", task) for task in run.tasks]
-    members += [(split, task) for split in HELD_OUT for task in family.tasks(split)]
+    members = [("train", task) for task in run.tasks] + held_out_members(run)
     found = run.jobs(
         look_at_member,
         [(settings, split, task, not note) for split, task in members],

@@ -29,10 +29,11 @@ def make_table(title: str, methods: Mapping[str, str], rows: Sequence[Mapping[st
             if not mine:
                 continue
             ratio = MISSING
-            if shared := sorted(mine.keys() & told.keys()):
+            shared = sorted(mine.keys() & told.keys())
+            returns, theirs = ([of[key][0] for key in shared] for of in (mine, told))
+            if sum(theirs) > 0:  # else there is no share of it
                 members = [key[-2] for key in shared]
-                pairs = ([of[key][0] for key in shared] for of in (mine, told))
-                found = relative_difference(*pairs, strata=members)
+                found = relative_difference(returns, theirs, strata=members)
                 low, high = 1 + found.low, 1 + found.high
                 ratio = f"{1 + found.value:.3f} [{low:.3f}, {high:.3f}]"
             returns = [value for value, _ in mine.values()]
@@ -43,7 +44,8 @@ def make_table(title: str, methods: Mapping[str, str], rows: Sequence[Mapping[st
         caption=(
             "Members of the family that no agent was trained on. Return / told: mean return over "
             "that of the policy that is told the parameter, from the same starts. Brackets: 95% "
-            "bootstrap interval over episodes, of each member at its own number."
+            "bootstrap interval over episodes, of each member at its own number; empty where that "
+            "policy's mean return is not above 0."
         ),
         header=("Members", "Policy", "Return", "Return / told", "Success", "Episodes"),
         rows=lines,
