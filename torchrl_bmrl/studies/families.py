@@ -185,7 +185,7 @@ def explore(run: Run, settings: FamilySettings) -> StoredExplorer:
     )
     if not note and not any(member.film and member.film.frames for member in found):
         note = "the environments of these tasks make no pictures."
-    return explore_members(family, found, note=note)
+    return explore_members(family, found, demonstrations=settings.demonstrations, note=note)
 
 
 def look_at_member(

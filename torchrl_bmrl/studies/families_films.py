@@ -6,8 +6,10 @@ import base64
 from contextlib import closing
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -54,7 +56,7 @@ def film_once(
     """
 
     def make(path: Path) -> None:
-        states = []
+        states: list[NDArray[Any]] = []
 
         def watch(*_: object) -> None:
             if scene is not None:
