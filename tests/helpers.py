@@ -25,10 +25,13 @@ from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.generators import Autoencoder
 from torchrl_bmrl.modules import (
     ActionVAE,
+    make_context_encoder,
     make_decoder,
+    make_gaussian_actor,
     make_latent_actor,
     make_perturbation_network,
     make_qvalue_network,
+    make_reward_models,
     make_task_classifier,
     make_task_encoder,
 )
@@ -36,9 +39,12 @@ from torchrl_bmrl.modules.generator import make_mlp
 from torchrl_bmrl.objectives import (
     BCQLoss,
     DiscreteBCQLoss,
+    FOCALLoss,
     FQELoss,
+    MBMLLoss,
     MetaDistillationLoss,
     PLASLoss,
+    RewardModelLoss,
     StackedLoss,
 )
 from torchrl_bmrl.testing import Case, discrete_transitions, transitions
@@ -259,6 +265,93 @@ def make_distillation_loss(
 ) -> MetaDistillationLoss:
     """A small loss with teachers of its own."""
     return distillation_case(num_tasks=num_tasks, teachers=teachers).make(**options)
+
+
+def focal_networks() -> dict[str, Any]:
+    latent = {"task_latent_dim": TASK_LATENT_DIM, "num_cells": CELLS}
+    return {
+        M: make_context_encoder(*DIMS, TASK_LATENT_DIM, num_features=4, num_cells=CELLS),
+        ACTOR: make_gaussian_actor(*DIMS, **latent),
+        "divergence_network": make_qvalue_network(*DIMS, **latent),
+        Q: make_qvalue_network(*DIMS, **latent),
+    }
+
+
+def task_data(*shape: int, **options: Any) -> TensorDict:
+    """Random transitions with an m, which critics alone can read."""
+    data = transitions(*shape, **options)
+    data["task_latent"] = transitions(*shape, **options, seed=2)["action"]
+    return data
+
+
+def focal_case(**options: Any) -> Case:
+    return Case(
+        FOCALLoss,
+        focal_networks,
+        {
+            "encoder": {M},
+            "divergence": {"divergence_network"},
+            "qvalue": {Q},
+            "actor": {ACTOR},
+        },
+        (Q,),
+        BOUNDS | {"context_size": 2, "divergence_weight": 1.0} | options,
+        task_data,
+        shape=(TASKS, 6),
+        need_not_fall=("actor", "divergence"),
+        mixes_rows=True,
+        by_task=True,
+    )
+
+
+def make_focal_loss(**options: Any) -> FOCALLoss:
+    """A small loss whose target networks differ from the trained ones."""
+    return focal_case().make(**options)
+
+
+def reward_models_case() -> Case:
+    def networks() -> dict[str, Any]:
+        return {"reward_models": make_reward_models(TASKS, *DIMS, num_models=4, num_cells=CELLS)}
+
+    trains = {"reward": {"reward_models"}}
+    return Case(RewardModelLoss, networks, trains, data=task_transitions, shape=(TASKS, ROWS))
+
+
+def mbml_networks() -> dict[str, Any]:
+    networks = distillation_networks() | reward_models_case().networks()
+    del networks["task_classifier"]
+    sizes = {"num_features": 4, "num_cells": CELLS}
+    return networks | {M: make_context_encoder(*DIMS, TASK_LATENT_DIM, **sizes)}
+
+
+def mbml_case(**options: Any) -> Case:
+    return Case(
+        MBMLLoss,
+        mbml_networks,
+        {
+            "generator": {G},
+            "direction": {G},
+            "qvalue": {M, "student_qvalue_network"},
+            "latent_norm": {M},
+            "triplet": {M},
+        },
+        options={
+            "latent_dim": LATENT_DIM,
+            "context_size": 2,
+            "max_deviation": 10.0,
+            "direction_weight": 1.0,
+            **options,
+        },
+        data=task_transitions,
+        shape=(TASKS, ROWS),
+        need_not_fall=("latent_norm", "triplet"),
+        mixes_rows=True,
+    )
+
+
+def make_mbml_loss(**options: Any) -> MBMLLoss:
+    """A small loss with teachers of its own and untrained reward models."""
+    return mbml_case().make(**options)
 
 
 def guide(name: str = "extending") -> ModuleType:

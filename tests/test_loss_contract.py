@@ -25,9 +25,12 @@ from helpers import (
     bcq_case,
     discrete_bcq_case,
     distillation_case,
+    focal_case,
     fqe_case,
     guide,
+    mbml_case,
     plas_case,
+    reward_models_case,
 )
 from tensordict import TensorDict
 from torchrl.data import Bounded, Unbounded
@@ -53,6 +56,8 @@ OFFLINE = {
     "discrete_bcq": discrete_bcq_case(),
     "discrete_bcq_categorical": discrete_bcq_case("categorical"),
     "fqe": fqe_case(),
+    "focal": focal_case(),
+    "focal_value_penalty": focal_case(value_penalty=True),
 }
 STUDENTS = {
     "distillation": distillation_case(context="current"),
@@ -62,9 +67,11 @@ STUDENTS = {
         STUDENT | {"metric": {M}}, context="set", metric_weight=0.5
     ),
 }
-CASES = OFFLINE | STUDENTS
+RELABELLING = {"mbml": mbml_case(), "reward_models": reward_models_case()}
+CASES = OFFLINE | STUDENTS | RELABELLING
 every = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 every_offline = pytest.mark.parametrize("case", OFFLINE.values(), ids=OFFLINE)
+every_relabelling = pytest.mark.parametrize("case", RELABELLING.values(), ids=RELABELLING)
 every_student = pytest.mark.parametrize("case", STUDENTS.values(), ids=STUDENTS)
 
 
@@ -108,13 +115,19 @@ class TestStudents(KeyedLossContract):
         refused(case.make(), data, repr(key), str(shape), "valid")
 
 
+@every_relabelling
+class TestRelabellingLosses(KeyedLossContract):
+    """What holds for a loss without critics of its own."""
+
+
 def test_every_loss_of_the_library_has_a_case() -> None:
     from torchrl_bmrl import objectives
 
     losses = {getattr(objectives, name) for name in objectives.__all__ if name.endswith("Loss")}
     losses -= {objectives.StackedLoss}  # holds the others; tests/test_stacked.py goes over CASES
     bases = {base for loss in losses for base in loss.__mro__[1:]}
-    assert losses - bases == {type(case.make()) for case in CASES.values()} - {guide().EMaQLoss}
+    found = {type(case.make()) for case in CASES.values()} - {guide().EMaQLoss}
+    assert losses - bases <= found <= losses  # MBMLLoss derives from a loss that has cases
 
 
 def test_keys_have_the_same_order_in_another_process() -> None:
@@ -153,7 +166,7 @@ def test_inductor_gives_the_same_values() -> None:
 
 SPEC = Bounded(low=torch.tensor([-1.0, -2.0]), high=torch.tensor([0.5, 3.0]), shape=(2,))
 VAE = ("bcq", "plas")
-BOUNDED = (*VAE, "rebrac")
+BOUNDED = (*VAE, "rebrac", "focal")
 BAD_OPTIONS = [
     (CASES, {"reduction": "avg"}, "'avg'; valid .*: mean, sum, none"),
     (OFFLINE, {"loss_function": "huber"}, "'huber'; valid .*: l2, l1, smooth_l1"),
@@ -168,8 +181,13 @@ BAD_OPTIONS = [
     (["bcq"], {"value_bounds": (1.0, 0.0)}, r"value_bounds are \(1.0, 0.0\); valid: \(low, high"),
     (["rebrac"], {"actor_penalty": -0.1}, "actor_penalty is -0.1; valid: at least 0"),
     (["rebrac"], {"critic_penalty": -0.1}, "critic_penalty is -0.1; valid: at least 0"),
+    (["focal"], {"context_size": 0}, "context_size is 0; valid: at least 1"),
+    (["focal"], {"divergence_weight": 401.0}, "divergence_weight is 401.0; valid: between 0 and"),
+    (["focal"], {"entropy_weight": -1.0}, "entropy_weight is -1.0; valid: at least 0"),
     (["discrete_bcq"], {"threshold": 1.5}, "threshold is 1.5; valid: between 0 and 1"),
     (["discrete_bcq"], {"action_space": "box"}, "'box'; valid .*: one-hot, categorical"),
+    (["mbml"], {"max_deviation": -0.1}, "max_deviation is -0.1; valid: at least 0"),
+    (["mbml"], {"triplet_margin": -1.0}, "triplet_margin is -1.0; valid: at least 0"),
     (STUDENTS, {"context": "next"}, "'next'; valid .*: current, previous, random, set"),
     (STUDENTS, {"context_fraction": 1.5}, "context_fraction is 1.5; valid: between 0 and 1"),
     (STUDENTS, {"context_size": 0}, "context_size is 0; valid: at least 1"),

@@ -27,7 +27,7 @@ vmap_or_loop = pytest.mark.parametrize("deactivate_vmap", [False, True], ids=["v
 def same_noise(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Draws that depend on an update's number and their shape alone, whoever makes them."""
     number = 0
-    drawn = {name: getattr(torch, name) for name in ("randn", "rand", "randint")}
+    drawn = {name: getattr(torch, name) for name in ("randn", "rand", "randint", "randperm")}
 
     def draw(name: str, shape: Any, *args: Any, **options: Any) -> Tensor:
         if "generator" in options:  # data, not noise
@@ -49,7 +49,13 @@ def same_noise(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 
     monkeypatch.setattr(torch, "randn", lambda *args, **o: draw("randn", as_shape(args), **o))
     monkeypatch.setattr(torch, "rand", lambda *args, **o: draw("rand", as_shape(args), **o))
+
+    def randperm(count: int, **options: Any) -> Tensor:
+        random = np.random.default_rng(number + count)
+        return torch.from_numpy(random.permutation(count))
+
     monkeypatch.setattr(torch, "randint", randint)
+    monkeypatch.setattr(torch, "randperm", randperm)
     monkeypatch.setattr(
         torch, "randn_like", lambda x: draw("randn", x.shape, dtype=x.dtype, device=x.device)
     )

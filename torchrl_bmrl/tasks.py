@@ -157,8 +157,8 @@ class Family:
         title: name in tables and figures; by default the name with spaces for underscores.
 
     Raises:
-        ConfigError: for a name that is not valid, a missing split or no trained member, or a
-            parameter of another length.
+        ConfigError: for a name that is not valid, a missing split or no trained member, a
+            parameter of another length, or the same parameter twice.
 
     Example:
         >>> def make(angle):
@@ -192,6 +192,12 @@ class Family:
                 raise ConfigError(
                     f"a member of family {self.name} is {parameter}; valid: {size} numbers"
                 )
+        if len(set(self.all())) < len(self.all()):
+            twice = next(x for i, x in enumerate(self.all()) if x in self.all()[:i])
+            raise ConfigError(
+                f"members of family {self.name} contain {twice} twice; valid: each parameter once, "
+                "in one split"
+            )
         if not self.title:
             object.__setattr__(self, "title", self.name.replace("_", " ").capitalize())
 

@@ -48,7 +48,8 @@ def measure_listening(
         seed: of the policy's random numbers.
 
     Raises:
-        BMRLError: for fewer than two states or two points.
+        BMRLError: for fewer than two states or two points, other shapes, or actions that are not
+            finite.
 
     Example:
         >>> from tensordict.nn import TensorDictModule
@@ -56,6 +57,9 @@ def measure_listening(
         >>> measure_listening(deaf, torch.randn(5, 2), torch.randn(3, 4)).share
         0.0
     """
+    for name, value in {"observation": observation, "task_latents": task_latents}.items():
+        if value.ndim != 2:
+            raise BMRLError(f"{name} has shape {tuple(value.shape)}; valid: (N, size)")
     if len(observation) < 2 or len(task_latents) < 2:
         raise BMRLError(
             f"{len(observation)} states and {len(task_latents)} points m; valid: at least two each"
@@ -63,11 +67,14 @@ def measure_listening(
     actions = []
     for latent in task_latents:
         data = {"observation": observation, "task_latent": latent.expand(len(observation), -1)}
-        with torch.random.fork_rng(devices=[]):
+        on_gpu = observation.device.type == "cuda"
+        with torch.random.fork_rng([observation.device] if on_gpu else []):
             torch.manual_seed(seed)
             made = policy(TensorDict(data, batch_size=[len(observation)]))
         actions.append(made.get("action"))
     stacked = torch.stack(actions).double()  # (K, N, action_dim)
+    if not stacked.isfinite().all():
+        raise BMRLError("the policy's actions are not finite; valid: a policy that did not diverge")
     # The variance is half of the mean squared difference of two draws.
     by_latent = 2 * stacked.var(0).sum(-1).mean().item()
     by_state = 2 * stacked.var(1).sum(-1).mean().item()

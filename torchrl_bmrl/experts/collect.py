@@ -191,7 +191,7 @@ def collect_demonstrations(
     return files
 
 
-WANDERING = 4
+WANDERING = 6
 """Experts that act in turn in an episode of another behaviour."""
 
 

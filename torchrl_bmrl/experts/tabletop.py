@@ -231,7 +231,8 @@ def record_episode(
         a composition ``stages``. The attribute ``env_args`` is robomimic's.
 
     Raises:
-        BMRLError: if the experts of ``after`` fail from 100 starts, or ``like`` has other skills.
+        BMRLError: if the experts of ``after`` fail from 100 starts, or ``like`` has other skills or
+            comes with ``after``.
 
     Example:
         >>> from torchrl_bmrl.tasks import get_task
@@ -248,6 +249,9 @@ def record_episode(
             f"like is {', '.join(task.name for task in like)}; valid: tasks with the same kind of "
             f"skill as {'-'.join(skill.name for skill in skills)}, which must be one"
         )
+    if acted and after:
+        names = (", ".join(task.name for task in tasks) for tasks in (like, after))
+        raise BMRLError("like is {} and after {}; valid: one of them".format(*names))
     before, experts_before = _chain(after)
     env = _env((*before, *skills), options)
     scene = env.robosuite_env
@@ -275,7 +279,8 @@ def record_episode(
     model_file = scene.scene_xml()
     actions, rewards, successes, phases, states, stages = [], [], [], [], [], []
     for step in range(horizon):
-        if acted and isinstance(expert, Expert):
+        if acted:
+            assert isinstance(expert, Expert)
             expert.skill = acted[step * len(acted) // horizon]
         action = act()
         phases.append(expert.phase)

@@ -19,6 +19,7 @@ from torchrl_bmrl.modules.generator import Network, make_mlp
 from torchrl_bmrl.modules.task_latent import (
     TRANSITION_KEYS,
     PrototypeTaskLatent,
+    check_reads_transitions,
     last_transition,
     only_in_environments,
 )
@@ -35,35 +36,45 @@ class ContextNetwork(nn.Module):
 
     .. math:: m = \rho\Big(\sum_k w_k\, \phi(x_k)\Big),
         \quad w_k = 1/K \ \text{ or } \ \mathrm{softmax}_k\, \psi(x_k),
-        \quad x_k = (s_k, a_k, r_k, (s'_k - s_k) / \sigma)
+        \quad x_k = (s_k, a_k, (r_k - \mu) / \rho, (s'_k - s_k) / \sigma)
 
     Reference: Zaheer et al., *Deep Sets*, NeurIPS 2017, https://arxiv.org/abs/1703.06114; the
     attention is the pooling with one seed vector of Lee et al., *Set Transformer*, ICML 2019,
     https://arxiv.org/abs/1810.00825.
 
     Args:
-        transition_dim: size of a transition.
+        observation_dim: size of the observation.
+        action_dim: size of the action.
         task_latent_dim: size of m.
         pooling: ``"mean"`` or ``"attention"``.
         num_features: size of φ.
         num_cells: widths of the hidden layers of φ and ψ together, and of ρ.
+
+    Attributes:
         step_scale: σ, how far each number of the observation moves in a step, ``(obs_dim,)``. A
             step is much smaller than the spread of the observations that a network is made for.
+        reward_loc: μ, ``(1,)``.
+        reward_scale: ρ, ``(1,)``.
     """
 
     step_scale: Tensor
+    reward_loc: Tensor
+    reward_scale: Tensor
 
     def __init__(
         self,
-        transition_dim: int,
+        observation_dim: int,
+        action_dim: int,
         task_latent_dim: int,
         pooling: str,
         num_features: int,
         num_cells: Sequence[int],
-        step_scale: Tensor,
     ) -> None:
         super().__init__()
-        self.register_buffer("step_scale", step_scale.detach().clone())
+        self.register_buffer("step_scale", torch.ones(observation_dim))
+        self.register_buffer("reward_loc", torch.zeros(1))
+        self.register_buffer("reward_scale", torch.ones(1))
+        transition_dim = 2 * observation_dim + action_dim + 1
         self.attends = pooling == "attention"
         self.each = make_mlp(transition_dim, num_features + self.attends, num_cells)
         self.whole = make_mlp(num_features, task_latent_dim, num_cells[-1:])
@@ -73,7 +84,24 @@ class ContextNetwork(nn.Module):
     ) -> Tensor:
         """φ and, with attention, ψ of each transition, ``(*B, K, n)``."""
         step = (following - observation) / self.step_scale
+        reward = (reward - self.reward_loc) / self.reward_scale
         return self.each(torch.cat([observation, action, reward, step], -1))
+
+    @torch.no_grad()
+    def set_scales(self, *datasets: TensorDictBase) -> None:
+        """Sets the buffers, so that rewards and steps are as large as the rest of the input.
+
+        Args:
+            *datasets: transitions of all tasks and behaviours, ``[N_i]`` each.
+        """
+        steps = torch.cat([x["next", "observation"] - x["observation"] for x in datasets])
+        reward = torch.cat([x["next", "reward"] for x in datasets])
+        # A number that hardly moves carries rounding errors, which must not be enlarged.
+        deviation = steps.double().std(0)
+        self.step_scale.copy_(torch.where(deviation > 1e-3, deviation, 1.0))
+        self.reward_loc.copy_(reward.double().mean(0))
+        deviation = reward.double().std(0)
+        self.reward_scale.copy_(torch.where(deviation > 0, deviation, 1.0))
 
     def combine(self, features: Tensor, mask: Tensor) -> Tensor:
         """m of the transitions that count, ``(*B, m)``.
@@ -91,8 +119,10 @@ class ContextNetwork(nn.Module):
 
     def forward(self, *context: Tensor) -> Tensor:
         """m of a context: the entries of :data:`CONTEXT_KEYS`."""
-        observation, action, reward, following, mask = context
-        return self.combine(self.features(observation, action, reward, following), mask)
+        *entries, mask = context
+        # What does not count may hold anything, also no numbers, which a weight of 0 leaves in.
+        entries = [entry.masked_fill(~mask.unsqueeze(-1), 0) for entry in entries]
+        return self.combine(self.features(*entries), mask)
 
 
 def make_context_encoder(
@@ -103,7 +133,6 @@ def make_context_encoder(
     pooling: str = "attention",
     num_features: int = 64,
     num_cells: Sequence[int] = (256, 256),
-    step_scale: Sequence[float] | Tensor | None = None,
 ) -> TensorDictModule:
     """Encoder :math:`M` of a set of transitions.
 
@@ -119,8 +148,6 @@ def make_context_encoder(
         pooling: ``"mean"``, or ``"attention"``: a weighted mean with learned weights.
         num_features: size of the embedding of one transition.
         num_cells: widths of the hidden layers.
-        step_scale: standard deviation of each number's change in a step, which the change is
-            divided by, ``(observation_dim,)``; ``None`` for 1.
 
     Raises:
         UnknownNameError: for another pooling.
@@ -134,10 +161,9 @@ def make_context_encoder(
     """
     if pooling not in POOLINGS:
         raise UnknownNameError("pooling", pooling, POOLINGS)
-    size = 2 * observation_dim + action_dim + 1
-    scale = torch.ones(observation_dim) if step_scale is None else torch.as_tensor(step_scale)
-    scale = scale.to(torch.get_default_dtype())
-    network = ContextNetwork(size, task_latent_dim, pooling, num_features, num_cells, scale)
+    network = ContextNetwork(
+        observation_dim, action_dim, task_latent_dim, pooling, num_features, num_cells
+    )
     sizes = {
         (CONTEXT, "observation"): observation_dim,
         (CONTEXT, "action"): action_dim,
@@ -164,13 +190,14 @@ def as_context(transitions: TensorDictBase, mask: Tensor | None = None) -> Tenso
 
     Args:
         transitions: batch ``[*B, K]``, with :data:`~torchrl_bmrl.modules.TRANSITION_KEYS`.
-        mask: which of them count, ``(*B, K)``; ``None`` if all do.
+        mask: which of them count, boolean, ``(*B, K)``, at least one of each set; ``None`` if all
+            do.
 
     Returns:
         batch ``[*B]``, with the transitions and ``mask`` under ``"context"``.
 
     Raises:
-        BMRLError: for no transition, or a missing key.
+        BMRLError: for no transition, a missing key, or a mask that does not fit.
 
     Example:
         >>> after = {"observation": torch.randn(9, 3), "reward": torch.randn(9, 1)}
@@ -189,6 +216,11 @@ def as_context(transitions: TensorDictBase, mask: Tensor | None = None) -> Tenso
     if mask is None:
         device = chosen.get("observation").device
         mask = torch.ones(shape, dtype=torch.bool, device=device)
+    elif mask.shape != shape or mask.dtype != torch.bool or not mask.any(-1).all():
+        raise BMRLError(
+            f"the mask is {mask.dtype} of shape {list(mask.shape)}; valid: torch.bool of shape "
+            f"{list(shape)}, with at least one transition of each set"
+        )
     return TensorDict({CONTEXT: chosen.set("mask", mask)}, batch_size=shape[:-1])
 
 
@@ -205,7 +237,8 @@ def embed_context(encoder: TensorDictModule, transitions: TensorDictBase) -> Ten
         ``(*B, m)``.
 
     Raises:
-        BMRLError: for no transition, a missing key, or sizes that the encoder does not take.
+        BMRLError: for no transition, a missing key, sizes that the encoder does not take, or an
+            encoder that reads something else.
 
     Example:
         >>> from torchrl_bmrl.modules import make_task_encoder
@@ -215,6 +248,8 @@ def embed_context(encoder: TensorDictModule, transitions: TensorDictBase) -> Ten
         torch.Size([2])
     """
     context = as_context(transitions)
+    if not reads_context(encoder):
+        check_reads_transitions(encoder)
     try:
         if reads_context(encoder):
             return encoder(context).get("task_latent")
@@ -238,7 +273,7 @@ class ContextTaskLatent(PrototypeTaskLatent):
 
     Raises:
         BMRLError: for an encoder of single transitions, or a context that :func:`as_context`
-            refuses.
+            refuses; at a reset, if the context's batch is not the environment's.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -249,6 +284,8 @@ class ContextTaskLatent(PrototypeTaskLatent):
         >>> latent.shape, latent[0]
         (torch.Size([3, 4]), tensor([0., 0., 0., 0.]))
     """
+
+    given: Tensor | None
 
     def __init__(
         self,
@@ -261,7 +298,8 @@ class ContextTaskLatent(PrototypeTaskLatent):
             raise BMRLError("the encoder reads single transitions; valid: make_context_encoder")
         self.encoder = encoder
         self.network = cast(ContextNetwork, encoder.module)
-        self.given = None if context is None else self._features(as_context(context))
+        given = None if context is None else self._features(as_context(context))
+        self.register_buffer("given", given)
         self._kept: Tensor | None = None
         self._valid: Tensor | None = None
 
@@ -274,18 +312,30 @@ class ContextTaskLatent(PrototypeTaskLatent):
     ) -> TensorDictBase:
         shape = tensordict_reset.batch_size
         reset = None if tensordict is None else tensordict.get("_reset", None)
-        if reset is None or self._valid is None:
-            first = self.given
-            if first is None:
-                self._kept = self._valid = None
-            else:
-                self._kept = first.expand(*shape, *first.shape[-2:])
-                self._valid = torch.ones(self._kept.shape[:-1], dtype=torch.bool)
+        if reset is None or self._kept is None or self._valid is None:
+            self._begin(shape)
         else:  # some of several environments begin anew
             given = 0 if self.given is None else self.given.shape[-2]
-            number = torch.arange(self._valid.shape[-1])
-            self._valid = self._valid & ~(reset.reshape(*shape, 1) & (number >= given))
+            number = torch.arange(self._valid.shape[-1], device=self._valid.device)
+            valid = self._valid & ~(reset.reshape(*shape, 1) & (number >= given))
+            # What counts nowhere any more would stay in memory for ever.
+            used = valid.reshape(-1, valid.shape[-1]).any(0)
+            self._kept, self._valid = self._kept[..., used, :], valid[..., used]
         return self._write(tensordict_reset)
+
+    def _begin(self, shape: torch.Size) -> None:
+        """All environments begin anew."""
+        if self.given is None:
+            self._kept = self._valid = None
+            return
+        batch = self.given.shape[:-2]
+        if batch and batch != shape:
+            raise BMRLError(
+                f"a context of batch {tuple(batch)} in an environment of {tuple(shape)}; valid: "
+                "one context, or one for each"
+            )
+        self._kept = self.given.expand(*shape, *self.given.shape[-2:])
+        self._valid = self._kept.new_ones(self._kept.shape[:-1], dtype=torch.bool)
 
     def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
         shape = tensordict.batch_size
@@ -301,7 +351,7 @@ class ContextTaskLatent(PrototypeTaskLatent):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         last = last_transition(tensordict, next_tensordict).unsqueeze(-1)
         features = self._features(as_context(last))
-        valid = torch.ones(features.shape[:-1], dtype=torch.bool)
+        valid = features.new_ones(features.shape[:-1], dtype=torch.bool)
         if self._kept is not None and self._valid is not None:
             features = torch.cat([self._kept, features], -2)
             valid = torch.cat([self._valid, valid], -1)

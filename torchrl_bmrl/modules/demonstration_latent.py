@@ -11,6 +11,7 @@ from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.modules.task_latent import (
     TRANSITION_KEYS,
     PrototypeTaskLatent,
+    check_reads_transitions,
     last_transition,
     only_in_environments,
 )
@@ -22,6 +23,7 @@ ALIGNMENTS = ("time", "state", "progress")
 @torch.no_grad()
 def _embed(demonstration: TensorDictBase, encoder: TensorDictModule) -> Tensor:
     """Embeddings of a demonstration's transitions, ``(T, m)``."""
+    check_reads_transitions(encoder)
     shapes = {}
     for key in TRANSITION_KEYS:
         value = demonstration.get(key, None)
@@ -57,7 +59,8 @@ class DemonstrationTaskLatent(PrototypeTaskLatent):
 
     Raises:
         BMRLError: for another alignment, a window below one, or a demonstration that is empty,
-            lacks a key, has stages that go back, or sizes that the encoder does not take.
+            lacks a key, has stages that go back, or sizes that the encoder does not take; and for
+            an encoder that reads anything but transitions.
 
     Example:
         >>> from torchrl.envs import TransformedEnv

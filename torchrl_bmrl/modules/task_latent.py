@@ -172,6 +172,20 @@ class PrototypeTaskLatent(Transform):
         return observation_spec
 
 
+def check_reads_transitions(encoder: TensorDictModule) -> None:
+    """Checks that an encoder of m reads single transitions and nothing else.
+
+    Args:
+        encoder: of m.
+
+    Raises:
+        BMRLError: naming what it reads.
+    """
+    others = [key for key in encoder.in_keys if key not in TRANSITION_KEYS]
+    if others:
+        raise BMRLError(f"the encoder reads {others}; valid: single transitions, {TRANSITION_KEYS}")
+
+
 def last_transition(tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDict:
     """The transition that an environment has just taken, with the keys that the encoder reads."""
     return TensorDict(
@@ -200,6 +214,9 @@ class OnlineTaskLatent(PrototypeTaskLatent):
         task_latent: the prototype of the first step, ``(m,)``.
         encoder: :func:`make_task_encoder`'s module, trained.
 
+    Raises:
+        BMRLError: for an encoder that reads anything but transitions.
+
     Example:
         >>> from torchrl.envs import TransformedEnv
         >>> from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
@@ -212,6 +229,7 @@ class OnlineTaskLatent(PrototypeTaskLatent):
 
     def __init__(self, task_latent: Tensor, encoder: TensorDictModule) -> None:
         super().__init__(task_latent)
+        check_reads_transitions(encoder)
         self.encoder = encoder
 
     @torch.no_grad()

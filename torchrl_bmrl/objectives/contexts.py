@@ -14,11 +14,11 @@ CONTEXT = "context"
 
 def group_rows(
     data: TensorDictBase, size: int, valid: Tensor | None = None
-) -> tuple[TensorDict, Tensor]:
+) -> tuple[TensorDict, Tensor, Tensor | None]:
     """Divides each task's rows into contexts at random, of 1 to ``size`` transitions each.
 
     A context leaves out a random share of its rows, so that an encoder learns from few transitions
-    and from many.
+    and from many. The rows that count are spread over the contexts evenly.
 
     Args:
         data: the rows, ``[num_tasks, B]``.
@@ -27,8 +27,9 @@ def group_rows(
 
     Returns:
         the contexts, ``[num_tasks, C]``, with ``[num_tasks, C, size]`` transitions and their
-        ``mask`` under ``"context"``; and the number of each row's own context, ``(B,)``, C for a
-        row that is in none.
+        ``mask`` under ``"context"``; the number of each row's own context, ``(num_tasks, B)``, C
+        for a row that is in none; and how many contexts of each task have a row that counts,
+        ``(num_tasks,)``, which are its first ones, ``None`` for all.
 
     Raises:
         BMRLError: for fewer rows than two contexts need.
@@ -41,32 +42,52 @@ def group_rows(
             f"contexts, {2 * size} rows"
         )
     device = data.device or next(iter(data.values(True, True))).device
-    order = torch.randperm(rows, device=device)[: count * size]
-    own = torch.full((rows,), count, device=device)
-    own[order] = torch.arange(count, device=device).repeat_interleave(size)
-    grouped = data[:, order].reshape(num_tasks, count, size)
+    if valid is None:
+        order = torch.randperm(rows, device=device)[: count * size].expand(num_tasks, -1)
+    else:
+        # Those that count come first, and each context gets one of them in turn.
+        drawn = torch.rand(num_tasks, rows, device=device)
+        order = (drawn + (~valid).to(drawn.dtype)).argsort(-1)[:, : count * size]
+        order = order.reshape(num_tasks, size, count).transpose(1, 2).flatten(1)
+    number = torch.arange(count, device=device).repeat_interleave(size)
+    own = torch.full((num_tasks, rows), count, device=device)
+    own = own.scatter(1, order, number.expand(num_tasks, -1))
+    task = torch.arange(num_tasks, device=device).unsqueeze(-1)
+    grouped = data[task, order].reshape(num_tasks, count, size)
     share = torch.rand(num_tasks, count, 1, device=device)
     mask = torch.rand(num_tasks, count, size, device=device) < share
     mask[..., 0] = True
+    filled = None
     if valid is not None:
-        mask = mask & valid[:, order].reshape(mask.shape)
-        mask = mask | ~mask.any(-1, keepdim=True)  # an empty one, whose rows count nowhere
+        mask = mask & valid.gather(1, order).reshape(mask.shape)
+        filled = mask[..., 0].sum(-1)
+        mask[..., 0] = True  # an empty context, which no row gets, must not be pooled
     context = grouped.set("mask", mask)
-    return TensorDict({CONTEXT: context}, batch_size=[num_tasks, count]), own
+    return TensorDict({CONTEXT: context}, batch_size=[num_tasks, count]), own, filled
 
 
-def assign(points: Tensor, own: Tensor, *, apart: bool) -> Tensor:
+def assign(points: Tensor, own: Tensor, filled: Tensor | None, *, apart: bool) -> Tensor:
     """Gives every row the embedding of a random context of its task.
 
     Args:
         points: embeddings of the contexts, ``(num_tasks, C, m)``.
-        own: number of each row's own context, ``(B,)``; C for none.
-        apart: whether a row must not get the context that it is part of.
+        own: number of each row's own context, ``(num_tasks, B)``; C for none.
+        filled: how many contexts of each task have rows that count, ``(num_tasks,)``; ``None`` for
+            all.
+        apart: whether a row must not get the context that it is part of. It does if its task has
+            no other one.
 
     Returns:
         ``(num_tasks, B, m)``.
     """
-    count = points.shape[1]
+    num_tasks, count, size = points.shape
     low = 1 if apart else 0
-    shift = torch.randint(low, count, own.shape, device=own.device)
-    return points[:, (own.clamp(max=count - 1) + shift) % count]
+    if filled is None:
+        shift = torch.randint(low, count, own.shape[1:], device=own.device)
+        chosen = (own.clamp(max=count - 1) + shift) % count
+    else:
+        number = filled.clamp(min=1).unsqueeze(-1)
+        drawn = torch.rand(own.shape, device=own.device)
+        shift = low + (drawn * (number - low)).long().clamp(max=count - 1)
+        chosen = (torch.minimum(own, number - 1) + shift) % number
+    return points.gather(1, chosen.unsqueeze(-1).expand(num_tasks, -1, size))

@@ -25,8 +25,7 @@ from torchrl_bmrl.objectives.student_terms import (
     arranging_errors,
     check_options,
     classify,
-    embed_rows,
-    embed_sets,
+    embed,
     encoded_keys,
     isometry,
     reads_sets,
@@ -34,7 +33,6 @@ from torchrl_bmrl.objectives.student_terms import (
 from torchrl_bmrl.objectives.teachers import check_teachers, per_task
 
 CONTEXTS = ("current", "previous", "random", "set", "given")
-OF_SETS = ("set", "given")
 ENCODER_TERMS = ("classification", "generator", "direction", "qvalue", "metric")
 ARRANGING_TERMS = ("metric", "distance", "contrastive")
 OTHER_TERMS = ("isometry", "advantage")
@@ -291,11 +289,7 @@ class MetaDistillationLoss(KeyedLoss):
         Raises:
             BMRLError: for missing keys, and for ``context="previous"`` without ``"previous"``.
         """
-        return self._embed(tensordict)[0]
-
-    def _embed(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """m of each row; and the embeddings of which the arranging terms compare pairs."""
-        return embed_sets(self, tensordict) if self.reads_sets else embed_rows(self, tensordict)
+        return embed(self, tensordict).latent
 
     def _entries(
         self, tensordict: TensorDictBase, keys: Iterable[NestedKey], under: NestedKey = ()
@@ -359,7 +353,7 @@ class MetaDistillationLoss(KeyedLoss):
         valid = self.valid_rows(tensordict, batch)
         task = entry(tensordict, keys.task, valid)
         check_tasks(keys.task, task, batch, valid)
-        m, compared = self._embed(tensordict)
+        m, points, points_valid = embed(self, tensordict)
         # M receives the gradients of the chosen terms only.
         reaching = {term: m if term in self.encoder_terms else m.detach() for term in ENCODER_TERMS}
         terms, metrics = {}, {}
@@ -389,8 +383,8 @@ class MetaDistillationLoss(KeyedLoss):
             "loss_latent_norm": self.latent_norm_weight * norm,
         }
         if "metric" not in self.encoder_terms:
-            compared = compared.detach()
-        for term, error in arranging_errors(self, compared, tensordict).items():
+            points = points.detach()
+        for term, error in arranging_errors(self, points, points_valid, batch).items():
             terms[f"loss_{term}"] = getattr(self, f"{term}_weight") * error
         if self.isometry_weight is not None:
             terms["loss_isometry"] = self.isometry_weight * isometry(self, tensordict)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
@@ -66,6 +66,14 @@ def advantage(
     other = loss._run("student_qvalue_network", states, key, target, given)
     error = (value - other) - (target - taught.get(key))
     return (error.squeeze(-1) / loss.advantage_scale[:, None]).square()
+
+
+class Embedded(NamedTuple):
+    """m of a batch."""
+
+    latent: Tensor  # of each row, (num_tasks, B, m)
+    points: Tensor  # that the arranging terms compare: of the rows, or of the sets, likewise
+    valid: Tensor | None  # which of the points count
 
 
 def reads_sets(encoder: TensorDictModule) -> bool:
@@ -144,24 +152,29 @@ def encode_previous(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> T
     return loss._encode(tensordict, under=name)
 
 
-def embed_rows(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-    """m of each row from single transitions, ``(num_tasks, B, m)``, twice."""
-    latent = loss._encode(tensordict)
+def embed(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> Embedded:
+    """m of each row, and the points that the arranging terms compare."""
+    return embed_sets(loss, tensordict) if loss.reads_sets else embed_rows(loss, tensordict)
+
+
+def embed_rows(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> Embedded:
+    """m of each row from single transitions."""
+    latent, valid = loss._encode(tensordict), loss.valid_rows(tensordict, tensordict.batch_size)
     if loss.context == "current":
-        return latent, latent
+        return Embedded(latent, latent, valid)
     if loss.context == "previous":
         other = encode_previous(loss, tensordict)
     else:
         # The other rows of a task are draws from its data, and so are its context.
         size = loss.context_size if loss.context == "set" else 1
-        other = draw_rows(latent, loss.valid_rows(tensordict, latent.shape[:2]), size).mean(2)
+        other = draw_rows(latent, valid, size).mean(2)
     chosen = torch.rand(latent.shape[:2], device=latent.device) < loss.context_fraction
     latent = torch.where(chosen.unsqueeze(-1), other, latent)
-    return latent, latent
+    return Embedded(latent, latent, valid)
 
 
-def embed_sets(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-    """m of each row from a random set of its task, ``(num_tasks, B, m)``, and m of the sets.
+def embed_sets(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> Embedded:
+    """m of each row from a random set of its task, and m of the sets.
 
     The sets are groups of the batch's own rows, and a row is not in its set; or groups of the rows
     under ``"context"``, which may be of another behaviour.
@@ -171,28 +184,31 @@ def embed_sets(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> tuple[
     valid = loss.valid_rows(tensordict, batch)
     inner = [unravel_key(key[1:]) for key in loss.task_encoder.in_keys if key[1:] != ("mask",)]
     rows = loss._entries(tensordict, inner, under=CONTEXT if given else ())
-    contexts, own = group_rows(rows, loss.context_size, valid)
+    contexts, own, filled = group_rows(rows, loss.context_size, valid)
     points = loss._run("task_encoder", contexts, loss.tensor_keys.task_latent)
-    return assign(points, own, apart=not given), points
+    if filled is not None:
+        number = torch.arange(points.shape[1], device=points.device)
+        valid = number < filled.unsqueeze(-1)
+    return Embedded(assign(points, own, filled, apart=not given), points, valid)
 
 
 def arranging_errors(
-    loss: MetaDistillationLoss, points: Tensor, tensordict: TensorDictBase
+    loss: MetaDistillationLoss, points: Tensor, valid: Tensor | None, batch: torch.Size
 ) -> dict[str, Tensor]:
     """Errors that pull embeddings of a task together and push those of different tasks apart.
 
     Args:
         loss: the loss.
         points: embeddings, ``(num_tasks, n, m)``.
-        tensordict: the data, ``[num_tasks, B]``.
+        valid: which of them count, ``(num_tasks, n)``; ``None`` if all do.
+        batch: shape of the rows, ``[num_tasks, B]``.
 
     Returns:
-        for each term with a weight ``(num_tasks, B)``; of sets each row has their mean.
+        for each term with a weight ``(num_tasks, B)``; of sets each row has its task's mean.
     """
     weights = (loss.metric_weight, loss.distance_weight, loss.contrastive_weight)
     if all(weight is None for weight in weights):
         return {}
-    valid = None if loss.reads_sets else loss.valid_rows(tensordict, tensordict.batch_size)
     near, far = draw_others(points, valid)
     errors = {}
     if loss.metric_weight is not None:
@@ -203,5 +219,7 @@ def arranging_errors(
         errors["contrastive"] = contrastive_error(points, near, loss.temperature)
     if not loss.reads_sets:
         return errors
-    batch = tensordict.batch_size
-    return {term: error.mean(1, keepdim=True).expand(batch) for term, error in errors.items()}
+    count = torch.ones_like(points[..., 0]) if valid is None else valid.to(points.dtype)
+    share = count / count.sum(1, keepdim=True).clamp(min=1)
+    means = {term: (share * error).sum(1, keepdim=True) for term, error in errors.items()}
+    return {term: mean.expand(batch) for term, mean in means.items()}

@@ -44,8 +44,33 @@ def draw_others(task_latent: Tensor, valid: Tensor | None) -> tuple[Tensor, Tens
         near = task_latent[:, (torch.arange(rows, device=device) + shift) % rows]
         far = task_latent
     else:
-        near, far = (draw_rows(task_latent, valid, 1).squeeze(2) for _ in range(2))
+        far = draw_rows(task_latent, valid, 1).squeeze(2)
+        # The same among the valid rows, which come first in this order.
+        order = (~valid).to(torch.uint8).argsort(dim=-1, stable=True)
+        count = valid.sum(-1, keepdim=True).clamp(min=1)
+        shift = 1 + (torch.rand(num_tasks, rows, device=device) * (count - 1)).long()
+        index = order.gather(1, (order.argsort(-1) + shift) % count)
+        near = task_latent.gather(1, index.unsqueeze(-1).expand_as(task_latent))
     shift = torch.randint(1, num_tasks, (num_tasks, rows), device=device)
     task = (torch.arange(num_tasks, device=device).unsqueeze(-1) + shift) % num_tasks
     row = torch.randint(rows, (num_tasks, rows), device=device)
     return near, far[task, row]
+
+
+def draw_pairs(points: Tensor) -> tuple[Tensor, Tensor]:
+    """For each point another one of its task and one of every other task.
+
+    Args:
+        points: ``(num_tasks, C, m)``.
+
+    Returns:
+        ``(num_tasks, C, m)`` and ``(num_tasks, C, num_tasks - 1, m)``.
+    """
+    num_tasks, count, _ = points.shape
+    device = points.device
+    shift = torch.randint(1, max(count, 2), (count,), device=device)
+    near = points[:, (torch.arange(count, device=device) + shift) % count]
+    task = torch.arange(num_tasks, device=device).unsqueeze(-1)
+    others = (task + torch.arange(1, num_tasks, device=device)) % num_tasks
+    index = torch.randint(count, (num_tasks, count, num_tasks - 1), device=device)
+    return near, points[others.unsqueeze(1), index]

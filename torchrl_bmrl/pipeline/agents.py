@@ -96,8 +96,8 @@ def load_bcq_loss(path: Path) -> tuple[BCQLoss, dict[str, Any]]:
         >>> state = {"module": make_bcq_loss(**options).state_dict()}
         >>> save_checkpoint(path, state, {"kind": "bcq", "task": "lift", "loss": options})
         >>> loss, metadata = load_bcq_loss(path)
-        >>> BCQPolicy.frozen(loss).out_keys, metadata["task"]
-        (['action'], 'lift')
+        >>> loss.num_qvalue_nets, metadata["task"]
+        (2, 'lift')
     """
     state, metadata = load_checkpoint(path, kind="bcq")
     options = with_sizes(metadata.get("loss"))

@@ -191,16 +191,18 @@ def expert_outcomes(run: Run, name: str, seeds: list[int]) -> list[EpisodeOutcom
     task, collect = run.task(name), run.settings.collect
     if run.settings.evaluate.expert_rollouts and task.record is not None:
         return _play_experts(task, collect.experts_of(name), seeds)
-    data = read_demonstrations(run.demonstrations(name), task, index=run.names.index(name))
-    success = data.get(("next", "success"), None)
-    returns = data["next", "reward"].double()
-    masks = [data["episode"] == i for i in data["episode"].unique()]
-    return [
-        EpisodeOutcome(
-            float(returns[mask].sum()), None if success is None else bool(success[mask].any())
-        )
-        for mask in masks
-    ]
+    # In context episodes other experts act.
+    several = task.record is not None and collect.context_episodes > 0
+    outcomes = []
+    for split in ("train", "valid") if several else (None,):
+        path, index = run.demonstrations(name), run.names.index(name)
+        data = read_demonstrations(path, task, split=split, index=index)
+        success = data.get(("next", "success"), None)
+        returns = data["next", "reward"].double()
+        for mask in [data["episode"] == i for i in data["episode"].unique()]:
+            succeeded = None if success is None else bool(success[mask].any())
+            outcomes.append(EpisodeOutcome(float(returns[mask].sum()), succeeded))
+    return outcomes
 
 
 def reference_outcomes(run: Run, name: str, seeds: Sequence[int]) -> list[EpisodeOutcome]:
@@ -223,8 +225,13 @@ def _play_experts(
     ]
 
 
-def embed(run: Run, split: str) -> tuple[Embeddings, float]:
-    """Embeddings of a split of the demonstrations and the classifier's accuracy on them."""
+def embed(run: Run, split: str) -> tuple[Embeddings, float | None]:
+    """Embeddings of a split of the demonstrations and the classifier's accuracy, if there is one.
+
+    Args:
+        run: the run.
+        split: of the demonstrations.
+    """
     student, metadata = run.student()
     with torch.random.fork_rng([]):
         torch.manual_seed(run.seed("untrained encoder"))
@@ -257,7 +264,7 @@ def embed(run: Run, split: str) -> tuple[Embeddings, float]:
             "untrained encoder": untrained.embed(data).numpy(),
         },
     )
-    return embeddings, student.accuracy(data)
+    return embeddings, None if metadata["accuracy"] is None else student.accuracy(data)
 
 
 def _distance(raw: TensorDictBase) -> np.ndarray:

@@ -12,6 +12,7 @@ from torchrl_bmrl.envs.transforms import ObservationStatistics
 from torchrl_bmrl.evaluation import read_results, summarise
 from torchrl_bmrl.export import export_policy
 from torchrl_bmrl.files import write_atomic
+from torchrl_bmrl.modules import reads_context
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.pipeline.evaluate import held_out_episode, run_facts
 from torchrl_bmrl.pipeline.run import Run
@@ -25,7 +26,7 @@ log = logging.getLogger(__name__)
 CARD = """# The distilled policy of preset {preset}, seed {seed}
 
 One policy for {number} tasks ({tasks}), conditioned on a task embedding m of {dim} numbers.
-{parameters:,} parameters: the encoder of m, its classifier, the generator of actions and the critic
+{parameters:,} parameters: the encoder of m{classifier}, the generator of actions and the critic
 that chooses among them. The file also contains a point of m for each task, the statistics that
 normalise observations, and one held-out demonstration of each task.
 
@@ -50,9 +51,7 @@ of each task, Adam at {lr:g}. {versions}.
 
 ## Results
 
-A linear layer names the task of {accuracy:.2%} of the held-out transitions from m.
-
-{table}
+{accuracy}{table}
 ## Limits
 
 - It was trained on these tasks alone, and on states like those of their demonstrations. In a chain
@@ -110,7 +109,11 @@ def _write_policy(run: Run, student: Student, metadata: dict[str, Any]) -> None:
         number=len(metadata["tasks"]),
         tasks=", ".join(run.titles[name].lower() for name in metadata["tasks"]),
         dim=student.prototypes.shape[-1],
-        parameters=sum(p.numel() for p in student.parameters()),
+        parameters=sum(
+            parameter.numel()
+            for name, parameter in student.named_parameters()
+            if metadata["accuracy"] is not None or not name.startswith("task_classifier.")
+        ),
         name=path.name,
         stem=path.stem,
         observation=len(run.statistics.loc),
@@ -125,11 +128,22 @@ def _write_policy(run: Run, student: Student, metadata: dict[str, Any]) -> None:
         batch=distill.batch_size,
         lr=distill.lr,
         versions=", ".join(f"{name} {version}" for name, version in versions.items()),
-        accuracy=metadata["accuracy"],
+        accuracy=_accuracy(student, metadata["accuracy"]),
+        classifier="" if metadata["accuracy"] is None else ", its classifier",
         table=table,
     )
     write_atomic(path.with_suffix(".md"), card)
     _log_size(path)
+
+
+def _accuracy(student: Student, accuracy: float | None) -> str:
+    """The card's paragraph on the classifier; empty without one."""
+    if accuracy is None:
+        return ""
+    of = "tasks, each from m of all its" if reads_context(student.task_encoder) else ""
+    named = f"{accuracy:.2%} of the {of or 'held-out transitions from m'}"
+    named = f"{named} held-out transitions" if of else named
+    return f"A linear layer names the task of {named}.\n\n"
 
 
 def _write_onnx(run: Run, student: Student, metadata: dict[str, Any]) -> None:

@@ -6,6 +6,7 @@ import logging
 import warnings
 from collections.abc import Callable
 from functools import partial
+from math import isnan, nan
 from typing import Any
 
 import torch
@@ -13,11 +14,11 @@ from tensordict import TensorDictBase
 
 from torchrl_bmrl.data.replay import check_device
 from torchrl_bmrl.evaluation.fitted_q import estimate_return
-from torchrl_bmrl.files import finite, read_rows, write_rows
+from torchrl_bmrl.files import finite, number, read_rows, write_rows
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.training_data import training_data
-from torchrl_bmrl.reports.tables import Table
+from torchrl_bmrl.reports.tables import MISSING, Table
 from torchrl_bmrl.run.workers import Report
 
 log = logging.getLogger(__name__)
@@ -27,7 +28,7 @@ COLUMNS: dict[str, Callable[[str], Any]] = {
     "loss_generator": finite,
     "loss_qvalue": finite,
     "distance": finite,
-    "accuracy": finite,
+    "accuracy": number,  # nan without a classifier
     "demonstrated": finite,
     "bcq": finite,
     "distilled": finite,
@@ -80,7 +81,7 @@ def evaluate_held_out(run: Run) -> Table:
             (
                 run.titles[str(row["task"])],
                 *(f"{row[key]:.4g}" for key in ("loss_generator", "loss_qvalue", "distance")),
-                f"{row['accuracy']:.1%}",
+                MISSING if isnan(float(row["accuracy"])) else f"{row['accuracy']:.1%}",
                 *(f"{row[key]:.2f}" for key in ("demonstrated", "bcq", "distilled")),
             )
             for row in rows
@@ -139,7 +140,7 @@ def _held_out(run: Run, name: str, report: Report) -> dict[str, str | float]:
         "loss_generator": generator.item(),
         "loss_qvalue": qvalue.item(),
         "distance": (acts[0] - acts[1]).norm(dim=-1).mean().item(),
-        "accuracy": student.accuracy(valid),
+        "accuracy": nan if metadata["accuracy"] is None else student.accuracy(valid),
         "demonstrated": _discounted_return(train, settings.bcq.gamma),
         **estimates,
     }

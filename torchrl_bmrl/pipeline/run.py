@@ -93,6 +93,8 @@ class Run:
         episodes = train_episodes(settings, self.tasks)
         collect = replace(settings.collect, train_episodes=episodes)
         self.settings = replace(settings, tasks=tasks, collect=collect)
+        if settings.distill.task_encoder == "told":
+            self.codes()  # tasks of no family are an error before anything is trained
         if (only := settings.only) is not None:
             unknown = [name for name in only if name not in self.names]
             if not only or unknown or len(set(only)) < len(only):
@@ -373,11 +375,12 @@ class Run:
         The task's horizon; without one gymnasium's, or the length of the longest demonstration.
 
         Args:
-            task: of the run, or one of its compositions.
+            task: of the run, one of its compositions, or a held-out member of its family.
         """
         horizon = task.horizon
         if horizon is None and "env" in task.options:
             horizon = max_episode_steps(task.options["env"], task.options.get("env_options"))
         if horizon is not None:
             return horizon
-        return int(self.transitions(task.name, "train")["step"].max()) + 1
+        names = [task.name] if task.name in self.names else self.names
+        return 1 + max(int(self.transitions(name, "train")["step"].max()) for name in names)

@@ -116,6 +116,8 @@ class DistillSettings:
     """
 
     updates: int = setting(12_000, above=0)  # number of updates
+    # Further updates, of an encoder that tells the task from any behaviour (context_episodes).
+    inference_updates: int = setting(0, at_least=0)
     batch_size: int = setting(64, above=0)  # transitions of each task per update
     lr: float = setting(1e-3, above=0)  # learning rate of Adam
     cosine: bool = True  # the learning rate decays to zero
@@ -154,12 +156,12 @@ class DistillSettings:
         """
         needs: dict[str, Any] = {}
         if self.task_encoder in OF_SETS:
-            needs = {"context_fraction": 1, "isometry_weight": 0}
+            needs = {"context_fraction": 1, "isometry_weight": 0, "prototype": "mean"}
             if self.context not in ("set", "given"):
                 needs["context"] = "set or given"
             elif self.batch_size < 2 * self.context_size:
                 needs["batch_size"] = f"at least {2 * self.context_size}, two contexts"
-        elif self.context == "given":
+        elif self.context == "given" or self.inference_updates:
             needs["task_encoder"] = " or ".join(OF_SETS)
         if self.task_encoder in ("one_hot", "told", "nothing"):
             needs["isometry_weight"] = 0
@@ -255,9 +257,11 @@ class Settings:
                     f"valid with this generator: {default}, the default"
                 )
         distill.check(evaluate.latent_sources)
-        if distill.context == "given" and not self.collect.context_episodes:
+        reads = distill.context == "given" or distill.inference_updates > 0
+        if reads and not self.collect.context_episodes:
             raise ConfigError(
-                "distill.context is given and collect.context_episodes 0; valid: at least 1"
+                f"distill.context is {distill.context}, distill.inference_updates "
+                f"{distill.inference_updates} and collect.context_episodes 0; valid: at least 1"
             )
         if self.only is not None and self.bcq.stacked:
             raise ConfigError(f"only is {self.only}; valid with bcq.stacked: null")

@@ -12,15 +12,18 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.optim import Adam
 
 from torchrl_bmrl.data import make_multi_task_replay_buffer, with_previous
 from torchrl_bmrl.functional import nonzero_scale, sample_action_latent
 from torchrl_bmrl.modules import BCQPolicy, reads_context
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
+from torchrl_bmrl.objectives import ContextInferenceLoss
+from torchrl_bmrl.pipeline.context_data import ContextSampler
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.settings import DistillSettings
 from torchrl_bmrl.pipeline.stage1 import sizes_of
-from torchrl_bmrl.pipeline.student import OF_SETS, Student, make_distillation_loss
+from torchrl_bmrl.pipeline.student import Student, make_distillation_loss
 from torchrl_bmrl.pipeline.training_data import deviation
 from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
 from torchrl_bmrl.run.workers import Report
@@ -38,7 +41,15 @@ from torchrl_bmrl.training.update import (
 log = logging.getLogger(__name__)
 
 OF_THE_STUDENT = ("task_encoder", "task_latent_dim", "num_cells")
-OF_THE_TRAINING = ("updates", "batch_size", "lr", "cosine", "normalise_qvalue", "prototype")
+OF_THE_TRAINING = (
+    "updates",
+    "inference_updates",
+    "batch_size",
+    "lr",
+    "cosine",
+    "normalise_qvalue",
+    "prototype",
+)
 
 
 def stage2(run: Run) -> None:
@@ -63,7 +74,7 @@ def stage2(run: Run) -> None:
         train_student,
         [StudentJob(run.settings.distill, "distill")],
         workers=1,
-        total=run.settings.distill.updates,
+        total=run.settings.distill.updates + run.settings.distill.inference_updates,
         description="stage 2: distilling",
         unit="update",
     )
@@ -143,9 +154,10 @@ def make_sampler(
     buffers = [make_multi_task_replay_buffer(data, **options) for data in (own, others)]
 
     def sample() -> TensorDictBase:
-        # Contexts of one behaviour, of the other, and mixed.
+        # A third of the contexts are of one behaviour alone, a third of the other: with a single
+        # demonstrated transition the encoder would not have to look at rewards.
         first, second = (contexts.sample().exclude("index") for contexts in buffers)
-        share = torch.rand(len(train), 1, device=first.device)
+        share = (3 * torch.rand(len(train), 1, device=first.device) - 1).clamp(0, 1)
         chosen = torch.rand(first.batch_size, device=first.device) < share
         return buffer.sample().set("context", torch.where(chosen, first, second))
 
@@ -172,13 +184,18 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
         **{name: getattr(distill, name) for name in OF_THE_STUDENT},
         "latent_dim": teachers[0].latent_dim,
         **({"code_dim": len(run.codes()[0])} if distill.task_encoder == "told" else {}),
+        **({"infers": True} if distill.inference_updates else {}),
         **sizes_of(train[0]),
     }
     student = Student(**options)
     if distill.task_encoder == "told":
         student.set_codes(run.codes())
-    elif distill.task_encoder in OF_SETS:
-        student.set_step_scale(train)
+    others = (
+        [run.transitions(name, "context") for name in run.names]
+        if distill.inference_updates
+        else []
+    )
+    student.set_scales(*train, *others)
     normalisation = value_statistics(teachers, train) if distill.normalise_qvalue else (None, None)
     loss = make_distillation_loss(
         student,
@@ -191,22 +208,24 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
         reward_scale=torch.stack([deviation(data["next", "reward"]) for data in train]),
         **loss_options(distill),
     ).to(settings.device)
-    optimizer = make_adam(loss.parameters(), lr=distill.lr)
+    optimizers = {"student": make_adam(loss.parameters(), lr=distill.lr)}
+    if student.context_encoder is not None:
+        optimizers["inference"] = make_adam(student.context_encoder.parameters(), lr=distill.lr)
     path = run.folder / student_job.folder / "checkpoint.safetensors"
-    saved = resume_training(
-        path, student, {"student": optimizer}, kind="student", device=settings.device
-    )
+    saved = resume_training(path, student, optimizers, kind="student", device=settings.device)
     done = saved["updates"] if saved else 0
     if done:
         log.debug("distillation: resumed from update %d", done)
         report(done)
-    if done == distill.updates:
+    end = distill.updates + distill.inference_updates
+    if done == end:
         return
+    inference: Inference | None = None
 
     def update(batch: TensorDictBase) -> dict[str, Tensor]:
         losses = loss(batch)
         total = sum(term for name, term in losses.items() if name.startswith("loss_"))
-        gradient_step(optimizer, total)
+        gradient_step(optimizers["student"], total)
         return {name: value.detach() for name, value in losses.items()}
 
     accelerated = accelerate(
@@ -217,8 +236,14 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
     )
 
     def step(number: int, batch: TensorDictBase) -> dict[str, Tensor]:
+        nonlocal inference
+        if number > distill.updates:
+            if inference is None:
+                student.set_prototypes(train, distill.prototype)
+                inference = Inference(student, optimizers["inference"], distill, train, others)
+            return inference.step(number - distill.updates)
         if distill.cosine:
-            decay(optimizer, distill.lr, number, distill.updates)
+            decay(optimizers["student"], distill.lr, number, distill.updates)
         return accelerated(batch.select(*loss.in_keys))
 
     def check(
@@ -234,7 +259,8 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
     def save(number: int) -> None:
         own = student if settings.device == "cpu" else deepcopy(student).to("cpu")
         own.set_prototypes(train, distill.prototype)
-        accuracy = own.accuracy(torch.cat(valid))
+        classifies = distill.classification_weight is not None
+        accuracy = own.accuracy(torch.cat(valid)) if classifies else None
         metadata = {
             "kind": "student",
             "tasks": list(run.names),
@@ -248,12 +274,13 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
         save_training(
             path,
             own,
-            {"student": optimizer},
+            optimizers,
             metadata,
             device=settings.device,
             keep=settings.keep_checkpoints,
         )
-        log.debug("distillation: update %d saved, accuracy %.1f%%", number, 100 * accuracy)
+        said = "" if accuracy is None else f", accuracy {accuracy:.1%}"
+        log.debug("distillation: update %d saved%s", number, said)
 
     with ExitStack() as stack:
         logger = make_logger(
@@ -264,12 +291,46 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
             step,
             sample,
             start=done,
-            total=distill.updates,
+            total=end,
             every=Every(log=settings.log_interval, save=settings.checkpoint_interval),
             check=check,
             save=save,
             report=report,
         )
+
+
+class Inference:
+    """Trains a student's encoder of any behaviour, after its policy is trained.
+
+    Args:
+        student: with prototypes.
+        optimizer: of its ``context_encoder``.
+        distill: settings of stage 2.
+        train: demonstrations of each task.
+        others: episodes of another behaviour of each task.
+    """
+
+    def __init__(
+        self,
+        student: Student,
+        optimizer: Adam,
+        distill: DistillSettings,
+        train: list[TensorDictBase],
+        others: list[TensorDictBase],
+    ) -> None:
+        assert student.context_encoder is not None
+        self.optimizer, self.distill = optimizer, distill
+        self.loss = ContextInferenceLoss(student.context_encoder, student.prototypes)
+        self.sample = ContextSampler(train, others, distill.context_size)
+
+    def step(self, number: int) -> dict[str, Tensor]:
+        """Does the update of a number, counted from 1."""
+        if self.distill.cosine:
+            decay(self.optimizer, self.distill.lr, number, self.distill.inference_updates)
+        device = self.loss.task_latents.device
+        losses = self.loss(self.sample().to(device))
+        gradient_step(self.optimizer, losses["loss_inference"])
+        return {name: value.detach() for name, value in losses.items()}
 
 
 @torch.no_grad()

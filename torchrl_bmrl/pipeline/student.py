@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import re
 import reprlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.transforms import Transform
 
-from torchrl_bmrl.errors import BMRLError, CheckpointError, UnknownNameError
+from torchrl_bmrl.errors import BMRLError, CheckpointError, ConfigError, UnknownNameError
 from torchrl_bmrl.modules import (
     BCQPolicy,
     ContextTaskLatent,
@@ -32,8 +30,10 @@ from torchrl_bmrl.modules import (
     prototype,
     reads_context,
 )
+from torchrl_bmrl.modules.context_encoder import ContextNetwork
 from torchrl_bmrl.objectives import MetaDistillationLoss
 from torchrl_bmrl.pipeline.agents import with_sizes
+from torchrl_bmrl.pipeline.metadata import are_statistics, is_number, is_task_name
 from torchrl_bmrl.training.checkpoint import build, load_checkpoint
 
 
@@ -49,6 +49,7 @@ class Student(nn.Module):
             :meth:`set_codes`; ``"nothing"``: m is one zero.
         task_latent_dim: size of m, except for the last two.
         code_dim: numbers that the policy is told about a task, see :meth:`set_codes`.
+        infers: whether there is a second encoder, which reads sets of any behaviour.
         num_cells: widths of the hidden layers.
         latent_dim: size of the teachers' ``action_latent``; by default twice the action's.
 
@@ -79,6 +80,7 @@ class Student(nn.Module):
         num_cells: Sequence[int] = (256, 256),
         latent_dim: int | None = None,
         code_dim: int = 1,
+        infers: bool = False,
     ) -> None:
         super().__init__()
         dims = (observation_dim, action_dim)
@@ -100,6 +102,13 @@ class Student(nn.Module):
             )
         else:
             self.task_encoder = make_task_encoder(*dims, task_latent_dim, num_cells=num_cells)
+        self.context_encoder = (
+            make_context_encoder(
+                *dims, task_latent_dim, num_features=INFERENCE_FEATURES, num_cells=num_cells
+            )
+            if infers
+            else None
+        )
         self.task_classifier = make_task_classifier(num_tasks, task_latent_dim)
         self.generator = make_decoder(
             *dims, latent_dim, task_latent_dim=task_latent_dim, num_cells=num_cells
@@ -128,21 +137,40 @@ class Student(nn.Module):
 
         Args:
             codes: numbers of each task, ``(num_tasks, code_dim)``.
+
+        Raises:
+            BMRLError: for another shape.
         """
         held = cast(Tensor, self.task_encoder.module.codes)
-        held.copy_(torch.tensor(codes, dtype=held.dtype))
+        table = torch.tensor(codes, dtype=held.dtype)
+        if table.shape != held.shape:
+            raise BMRLError(f"codes are of shape {tuple(table.shape)}; valid: {tuple(held.shape)}")
+        held.copy_(table)
 
-    def set_step_scale(self, datasets: Sequence[TensorDictBase]) -> None:
-        """Tells an encoder of sets how far each number of the observation moves in a step.
+    def set_scales(self, *datasets: TensorDictBase) -> None:
+        """Tells the encoders of sets how large rewards and steps are.
 
         Args:
-            datasets: training transitions, ``[N_i]`` each.
+            *datasets: transitions of all tasks and behaviours, ``[N_i]`` each.
         """
-        steps = torch.cat([x["next", "observation"] - x["observation"] for x in datasets])
-        deviation = steps.double().std(0)
-        held = cast(Tensor, self.task_encoder.module.step_scale)
-        # A number that hardly moves carries rounding errors, which must not be enlarged.
-        held.copy_(torch.where(deviation > 1e-3, deviation, 1.0))
+        for encoder in (self.task_encoder, self.context_encoder):
+            if encoder is not None and reads_context(encoder):
+                cast(ContextNetwork, encoder.module).set_scales(*datasets)
+
+    def check_embeds(self, what: str) -> None:
+        """Checks that single transitions have an embedding.
+
+        Args:
+            what: what needs it, for the message.
+
+        Raises:
+            ConfigError: for an encoder of sets.
+        """
+        if reads_context(self.task_encoder):
+            raise ConfigError(
+                f"{what} needs m of single transitions, and the policy's encoder reads sets of "
+                "them; valid: a policy trained with distill.task_encoder=transition"
+            )
 
     def embed_context(self, context: TensorDictBase) -> Tensor:
         """Returns the embedding m of a set of transitions of one task, ``(*B, task_latent_dim)``.
@@ -156,6 +184,20 @@ class Student(nn.Module):
             BMRLError: as :func:`~torchrl_bmrl.modules.embed_context`.
         """
         return embed_context(self.task_encoder, context)
+
+    def infer(self, context: TensorDictBase) -> Tensor:
+        """Returns m of a set of transitions of any behaviour, ``(*B, task_latent_dim)``.
+
+        :meth:`embed_context` reads the task from what a demonstrator does. This reads it from
+        rewards and motion, if the student was trained with ``infers``; else it is the same.
+
+        Args:
+            context: normalised transitions, batch ``[*B, K]``.
+
+        Raises:
+            BMRLError: as :func:`~torchrl_bmrl.modules.embed_context`.
+        """
+        return embed_context(self.context_encoder or self.task_encoder, context)
 
     @torch.no_grad()
     def set_prototypes(self, datasets: Sequence[TensorDictBase], kind: str) -> None:
@@ -222,17 +264,20 @@ class Student(nn.Module):
 
         Raises:
             UnknownNameError: for another source.
-            BMRLError: as :class:`~torchrl_bmrl.modules.DemonstrationTaskLatent`.
+            BMRLError: without the demonstration that the last source needs, for an encoder that
+                reads no transitions, and as :class:`~torchrl_bmrl.modules.DemonstrationTaskLatent`.
         """
         if source == "prototype":
             return PrototypeTaskLatent(self.prototypes[task])
+        if source == "demonstration" and demonstration is None:
+            raise BMRLError("the source demonstration has none; valid: transitions of one episode")
         sets = reads_context(self.task_encoder)
         if source == "online":
             kind = ContextTaskLatent if sets else OnlineTaskLatent
-            return kind(self.prototypes[task], self.task_encoder)
+            return kind(self.prototypes[task], self.context_encoder or self.task_encoder)
         if source == "demonstration":
+            assert demonstration is not None
             if sets:
-                assert demonstration is not None
                 return PrototypeTaskLatent(self.embed_context(demonstration))
             return DemonstrationTaskLatent(demonstration, self.task_encoder)
         raise UnknownNameError("latent source", source, LATENT_SOURCES)
@@ -279,6 +324,8 @@ def make_distillation_loss(
     )
 
 
+INFERENCE_FEATURES = 128
+"""Size of the embedding of one transition in the encoder of any behaviour."""
 LATENT_SOURCES = ("prototype", "online", "demonstration")
 OF_SETS = ("set_mean", "set_attention")
 TASK_ENCODERS = ("transition", *OF_SETS, "one_hot", "told", "nothing")
@@ -316,12 +363,15 @@ def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
     number = len(student.prototypes)
     valid: dict[str, tuple[Callable[[Any], bool], str]] = {
         "tasks": (
-            lambda x: isinstance(x, list) and all(map(_is_task_name, x)) and len(set(x)) == number,
+            lambda x: isinstance(x, list) and all(map(is_task_name, x)) and len(set(x)) == number,
             f"{number} different names, one per prototype",
         ),
-        "latent_clip": (lambda x: x is None or (_is_number(x) and x > 0), "a number above 0, null"),
-        "accuracy": (lambda x: _is_number(x) and 0 <= x <= 1, "a number between 0 and 1"),
-        "statistics": (_are_statistics, "loc and scale, as many numbers in each, scale above 0"),
+        "latent_clip": (lambda x: x is None or (is_number(x) and x > 0), "a number above 0, null"),
+        "accuracy": (
+            lambda x: x is None or (is_number(x) and 0 <= x <= 1),
+            "a number between 0 and 1, or null without a classifier",
+        ),
+        "statistics": (are_statistics, "loc and scale, as many numbers in each, scale above 0"),
     }
     for key, (holds, what) in valid.items():
         if not holds(metadata.get(key)):
@@ -329,31 +379,3 @@ def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
                 path, f"{key} is {reprlib.repr(metadata.get(key))}; valid: {what}"
             )
     return student, metadata
-
-
-def _is_number(x: Any) -> bool:
-    return isinstance(x, float | int) and math.isfinite(x)
-
-
-def _is_name(x: Any) -> bool:
-    return isinstance(x, str) and 0 < len(x) <= 200
-
-
-def _is_task_name(x: Any) -> bool:
-    """Whether a task's name can be part of a file name."""
-    return _is_name(x) and re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", x) is not None
-
-
-def _are_statistics(x: Any) -> bool:
-    if not isinstance(x, dict) or set(x) - {"parts"} != {"loc", "scale"}:
-        return False
-    parts = x.get("parts", [])
-    if not isinstance(parts, list) or not all(map(_is_name, parts)):
-        return False
-    lists = isinstance(x["loc"], list) and isinstance(x["scale"], list)
-    return (
-        lists
-        and len(x["loc"]) == len(x["scale"])
-        and all(map(_is_number, [*x["loc"], *x["scale"]]))
-        and all(scale > 0 for scale in x["scale"])
-    )

@@ -7,7 +7,7 @@ of another behaviour, its own first episode, the nearest trained member, or noth
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -21,20 +21,22 @@ from torch import Tensor
 from torchrl_bmrl.data.episodes import as_tensordict
 from torchrl_bmrl.data.robomimic import keep_episode, read_kept_episode
 from torchrl_bmrl.envs.transforms import transform_data
-from torchrl_bmrl.errors import BMRLError, ConfigError
+from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
 from torchrl_bmrl.experts.collect import WANDERING, others_than
 from torchrl_bmrl.files import number, read_rows, whole, write_rows
-from torchrl_bmrl.modules import BCQPolicy, PathTaskLatent
+from torchrl_bmrl.modules import BCQPolicy, PathTaskLatent, reads_context
+from torchrl_bmrl.modules.task_latent import check_reads_transitions
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.settings import DistillSettings
 from torchrl_bmrl.pipeline.stage2 import StudentJob, train_student
 from torchrl_bmrl.pipeline.student import Student, load_student
+from torchrl_bmrl.pipeline.task_files import with_run_options
 from torchrl_bmrl.reports import Section, write_study
 from torchrl_bmrl.reports.explorer import StoredExplorer
 from torchrl_bmrl.reports.members import Member, explore_members
 from torchrl_bmrl.run.folder import open_run
-from torchrl_bmrl.run.settings import setting
+from torchrl_bmrl.run.settings import check_settings, setting
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.studies.families_films import film_once, why_no_films
 from torchrl_bmrl.studies.families_line import LINES, POINTS, line_table, lines_of, play_line
@@ -71,7 +73,7 @@ class FamilySettings:
 
     episodes: int = setting(5, above=0)  # of each held-out member with each method
     demonstrations: int = setting(1, above=0)  # episodes of a context
-    methods: list[str] = setting(list(METHODS), choices=tuple(METHODS))  # to compare
+    methods: list[str] = setting(list(METHODS), choices=tuple(METHODS), unique=True)  # to compare
     cloning_updates: int = setting(2000, above=0)  # of behaviour cloning on the demonstration
     # Changes to distill for the policies told the parameter, told nothing, and with one-hot codes.
     students: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -80,6 +82,8 @@ class FamilySettings:
 
 _OTHERS: dict[str, str] = {"told": "told", "one_hot": "one_hot", "no_context": "nothing"}
 """Encoders of the students that are trained for the comparison, by method."""
+_OF_CONTEXTS = {"demonstration", "behaviour", "one_shot"}
+"""Methods whose m is that of a context."""
 
 
 def generalise(run: Run, settings: FamilySettings) -> str:
@@ -102,13 +106,15 @@ def generalise(run: Run, settings: FamilySettings) -> str:
     run.check_open()
     family, methods = run.family, settings.methods
     run.check_playable()
-    run.student()  # a missing policy is an error before anything is written
+    student, _ = run.student()  # a missing policy is an error before anything is written
+    if set(methods) & _OF_CONTEXTS and not reads_context(student.task_encoder):
+        check_reads_transitions(student.task_encoder)
     if "behaviour" in methods and not run.settings.collect.context_episodes:
         raise ConfigError(
             "families.methods has behaviour and collect.context_episodes is 0; valid: without it"
         )
-    open_run(run.folder / settings.folder, asdict(settings))
     others = [student_job(run, settings, name) for name in methods if name in _OTHERS]
+    open_run(run.folder / settings.folder, asdict(settings))
     run.jobs(
         train_student,
         others,
@@ -116,19 +122,25 @@ def generalise(run: Run, settings: FamilySettings) -> str:
         description="training the students of the comparison",
         unit="update",
     )
-    members = [(split, task) for split in HELD_OUT for task in family.tasks(split)]
+    members = [
+        (split, with_run_options(task, run.settings))
+        for split in HELD_OUT
+        for task in family.tasks(split)
+    ]
     steps = sum(run.horizon(task) for _, task in members) * settings.episodes * len(methods)
     jobs = [(settings, split, task) for split, task in members]
     results = run.jobs(play_member, jobs, total=steps, description="playing", unit="step")
     rows = [row for part in results for row in part]
     write_rows(run.folder / settings.folder / "results.csv", rows)
     table = make_table(family.title, {name: METHODS[name] for name in methods}, rows)
-    heading, explorer = "Tasks that nobody trained on", explore(run, settings)
-    section = Section(heading=heading, tables=[table], explorer=explorer)
+    explorer = explore(run, settings, members) if "demonstration" in methods else None
+    section = Section(heading="Tasks that nobody trained on", tables=[table], explorer=explorer)
     write_study(run.folder, "families", section, {})
     if family.measure is None or "one_hot" not in methods:
         return table.markdown()
     lines = [(settings, code, pair) for code in LINES for pair in lines_of(run)]
+    if not lines:  # too few members
+        return table.markdown()
     steps = sum(run.horizon(run.task(start)) for _, _, (start, _) in lines)
     results = run.jobs(
         play_line,
@@ -150,7 +162,23 @@ def generalise(run: Run, settings: FamilySettings) -> str:
 
 
 def student_job(run: Run, settings: FamilySettings, method: str) -> StudentJob:
-    """The student of a method, trained as the run's own but for what it is told."""
+    """The student of a method, trained as the run's own but for what it is told.
+
+    Args:
+        run: the run.
+        settings: of the study.
+        method: one of those with a student of their own.
+
+    Raises:
+        BMRLError: for ``students`` of another method, or with settings that are not valid.
+    """
+    for name in settings.students:
+        if name not in _OTHERS:
+            raise UnknownNameError("method in families.students", name, tuple(_OTHERS))
+    own, known = settings.students.get(method, {}), vars(run.settings.distill)
+    for name in own:
+        if name not in known:
+            raise UnknownNameError(f"setting in families.students.{method}", name, tuple(known))
     changes: dict[str, Any] = {
         "task_encoder": _OTHERS[method],
         "context": "current",
@@ -162,20 +190,23 @@ def student_job(run: Run, settings: FamilySettings, method: str) -> StudentJob:
         "classification_weight": None,
     }
     distill: DistillSettings = replace(run.settings.distill, **changes)
-    distill = replace(distill, **settings.students.get(method, {}))
+    distill = replace(distill, **own)
+    check_settings(distill, f"families.students.{method}.")
+    distill.check(["prototype"])
     return StudentJob(distill, f"{settings.folder}/{method}")
 
 
-def explore(run: Run, settings: FamilySettings) -> StoredExplorer:
+def explore(
+    run: Run, settings: FamilySettings, held_out: Sequence[tuple[str, Task]]
+) -> StoredExplorer:
     """All members in the embedding, each with a film if films can be made.
 
     Args:
         run: the run.
         settings: of the study.
+        held_out: members with their splits.
     """
-    note, family = why_no_films(), run.family
-    members = [("train", task) for task in run.tasks]
-    members += [(split, task) for split in HELD_OUT for task in family.tasks(split)]
+    note, members = why_no_films(), [*(("train", task) for task in run.tasks), *held_out]
     found = run.jobs(
         look_at_member,
         [(settings, split, task, not note) for split, task in members],
@@ -185,7 +216,7 @@ def explore(run: Run, settings: FamilySettings) -> StoredExplorer:
     )
     if not note and not any(member.film and member.film.frames for member in found):
         note = "the environments of these tasks make no pictures."
-    return explore_members(family, found, demonstrations=settings.demonstrations, note=note)
+    return explore_members(run.family, found, demonstrations=settings.demonstrations, note=note)
 
 
 def look_at_member(
@@ -281,7 +312,9 @@ def make_method(
         if method == "first":
             latent = first_latents(run, student, task, 0)
         else:
-            latent = student.embed_context(context(run, settings, task, method))
+            given = context(run, settings, task, method)
+            reads = student.embed_context if method == "demonstration" else student.infer
+            latent = reads(given)
     policy = student.policy(num_candidates=count, latent_clip=metadata["latent_clip"])
     return policy, latent
 

@@ -28,6 +28,7 @@ from torchrl_bmrl.evaluation import bootstrap_interval
 from torchrl_bmrl.files import read_rows, whole, write_rows
 from torchrl_bmrl.modules import DemonstrationTaskLatent, StageTaskLatent
 from torchrl_bmrl.modules.demonstration_latent import ALIGNMENTS
+from torchrl_bmrl.modules.task_latent import check_reads_transitions
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.reports import Section, Table, write_study
 from torchrl_bmrl.run.folder import open_run
@@ -82,7 +83,8 @@ def imitate(run: Run, settings: ImitateSettings) -> str:
     run.check_open()
     task = run.composition(settings.composition)
     _check(settings, task)
-    run.student()  # a missing policy is an error before anything is written
+    # A missing policy, or one that cannot take part, is an error before anything is written.
+    check_reads_transitions(run.student()[0].task_encoder)
     open_run(run.folder / settings.folder, asdict(settings))
     with progress(settings.demonstrations, "demonstrating", "demonstration") as bar:
         for number in range(settings.demonstrations):

@@ -96,6 +96,7 @@ def interpolate(run: Run, settings: InterpolationSettings) -> str:
             f"{len(names)} tasks"
         )
     embedding = Embedding(run, settings)
+    embedding.student.check_embeds("interpolation")
     switching = settings.switching in names and len(embedding.held_out()[0]) > 1
     for name in [settings.task, *([settings.switching] if switching else [])]:
         position_columns(run, settings, name)  # an error here leaves no folder

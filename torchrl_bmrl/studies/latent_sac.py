@@ -96,7 +96,8 @@ def latent_sac(run: Run, settings: LatentSACSettings) -> str:
             f"latent_sac.random_steps is {settings.random_steps}; valid: 0 to environment_steps"
         )
     run.composition(settings.composition)
-    run.student()  # a missing policy is an error before anything is written
+    # A missing policy, or one that cannot take part, is an error before anything is written.
+    run.student()[0].check_embeds("latent_sac")
     folder = run.folder / settings.folder
     # Seeds may be added later; all other settings must agree.
     open_run(folder, {name: x for name, x in asdict(settings).items() if name != "seeds"})

@@ -115,6 +115,8 @@ class Case:
         need_not_fall: terms that training may increase, because they follow another network.
         mixes_rows: whether a row's losses depend on other rows of its batch, for example by a
             context that is drawn from the batch.
+        by_task: whether row i of a batch ``[num_tasks, B]`` belongs to task i, so that rows cannot
+            be in one dimension; such a loss mixes rows.
 
     Example:
         >>> from torchrl_bmrl.modules import ActionVAE, make_qvalue_network
@@ -141,6 +143,7 @@ class Case:
     shape: tuple[int, ...] = (8,)
     need_not_fall: Collection[str] = ("actor", "perturbation")
     mixes_rows: bool = False
+    by_task: bool = False
 
     def batch(self, *shape: int, dtype: torch.dtype = torch.float64) -> TensorDict:
         """A batch of the case's data.

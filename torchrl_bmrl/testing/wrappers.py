@@ -14,13 +14,13 @@ from torchrl_bmrl.testing.case import CRITIC, Case
 
 
 def renamed(key: Any, names: Mapping[Any, Any]) -> Any:
-    """A key with its new name; the prefixes ``"next"`` and ``"previous"`` are kept.
+    """A key with its new name; the prefixes ``"next"``, ``"previous"`` and ``"context"`` are kept.
 
     Example:
         >>> renamed(("next", "reward"), {"reward": ("my", "reward")})
         ('next', 'my', 'reward')
     """
-    if isinstance(key, tuple) and key[0] in ("next", "previous"):
+    if isinstance(key, tuple) and key[0] in ("next", "previous", "context"):
         rest = key[1] if len(key) == 2 else key[1:]
         return unravel_key((names.get(key[0], key[0]), renamed(rest, names)))
     return names.get(key, key)

@@ -112,7 +112,13 @@ class OfflineGradientChecks:
             for name, params in loss.named_children()
             if any(value is torso.weight for value in params.parameters())
         }
-        readers = {CRITIC} if sharing == "critics" else all_of(case.trains)
+        # An encoder of contexts reads no observation, but contexts.
+        reading = {
+            name
+            for name, parts in networks.items()
+            if any(hasattr(part, "torso") for part in parts)
+        }
+        readers = {CRITIC} if sharing == "critics" else all_of(case.trains) & reading
         assert holders == {f"{name}_params" for name in readers}, "who holds the shared torso"
         fresh, *_ = on_torso(case, **options, seed=1)
         fresh.load_state_dict(loss.state_dict(), strict=True)
