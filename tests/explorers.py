@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 
 from torchrl_bmrl.reports import Explorer, Section, paper, task_colors, task_titles, write_page
+from torchrl_bmrl.reports.explorer import StoredExplorer
 
 STEPS = 21
 TASKS = tuple(paper.TABLE_1)
@@ -46,9 +47,10 @@ def make_explorer(**changes: Any) -> Explorer:
     return replace(explorer, **changes)
 
 
-def page_of(explorer: Explorer, folder: Path) -> Path:
+def page_of(explorer: Explorer | StoredExplorer, folder: Path) -> Path:
     """Writes a page with the explorer and returns its path."""
     path = folder / "report.html"
-    section = Section(heading="Explore", paragraphs=explorer.paragraphs(), explorer=explorer)
+    text = explorer.paragraphs() if isinstance(explorer, Explorer) else ()
+    section = Section(heading="Explore", paragraphs=text, explorer=explorer)
     write_page(path, title="A run", facts={}, sections=[section])
     return path

@@ -281,6 +281,36 @@ def test_a_single_point_is_shown(browser: Browser, tmp_path: Path) -> None:
     assert browser.driver.get_log("browser") == []
 
 
+def test_a_click_on_a_member_of_a_family_plays_its_film(browser: Browser, tmp_path: Path) -> None:
+    from families import lifted
+
+    browser.open(page_of(lifted(), tmp_path))
+    yellow = "#fde725"  # of the largest height, which lies at the right
+    pixels: list[tuple[int, int]] = []
+    browser.wait(lambda: bool(pixels.extend(browser.pixels(yellow)) or pixels))
+    browser.point_at(*(sum(axis) / len(pixels) for axis in zip(*pixels, strict=True)), click=True)
+    slider = browser.part("slider")
+    browser.wait(lambda: slider.get_attribute("value") == "2")
+    assert browser.shown("task") == "Lift to height 26"
+    assert browser.shown("fact-0") == "26"
+    assert browser.shown("fact-1") == "held out, outside the trained range"
+    assert browser.shown("time") == "0.50 s (step 10)"
+    # The pointer is still on the point; the film of it is what is shown.
+    assert browser.part("which").text == "Chosen point"
+    assert browser.part("frame").get_attribute("alt") == "Lift to height 26, at 0.50 s"
+    assert not browser.part("show-phase").is_displayed()
+    assert browser.driver.get_log("browser") == []
+
+
+def test_without_films_there_is_nothing_to_play(browser: Browser, tmp_path: Path) -> None:
+    from families import lifted
+
+    browser.open(page_of(lifted(films=False, note="egl: none."), tmp_path))
+    assert browser.part("noframe").text == "There are no films: egl: none."
+    assert not browser.part("play").is_displayed()
+    assert browser.driver.get_log("browser") == []
+
+
 def test_the_page_fits_a_narrow_screen(browser: Browser) -> None:
     driver = browser.driver
     before = driver.get_window_size()

@@ -21,8 +21,12 @@ pytestmark = pytest.mark.filterwarnings(NO_UPDATER)
 def make_loss() -> FOCALLoss:
     """A loss for the point mass, whose rewards are about -1."""
     latent = {"task_latent_dim": 4, "num_cells": (32, 32)}
+    encoder = modules.make_context_encoder(
+        2, 2, 4, pooling="mean", num_features=16, num_cells=(32, 32)
+    )
+    encoder.module.set_scales(point_mass(GOALS, 48, seed=2000).flatten())
     return FOCALLoss(
-        modules.make_context_encoder(2, 2, 4, pooling="mean", num_features=16, num_cells=(32, 32)),
+        encoder,
         modules.make_gaussian_actor(2, 2, **latent),
         modules.make_qvalue_network(2, 2, **latent),
         modules.make_qvalue_network(2, 2, **latent),

@@ -25,7 +25,7 @@ from torchrl_bmrl.objectives.student_terms import (
     arranging_errors,
     check_options,
     classify,
-    embed,
+    embedded,
     encoded_keys,
     isometry,
     reads_sets,
@@ -289,7 +289,9 @@ class MetaDistillationLoss(KeyedLoss):
         Raises:
             BMRLError: for missing keys, and for ``context="previous"`` without ``"previous"``.
         """
-        return embed(self, tensordict).latent
+        return self._embed(tensordict).latent
+
+    _embed = embedded  # a function of the loss and its data, which a subclass may replace
 
     def _entries(
         self, tensordict: TensorDictBase, keys: Iterable[NestedKey], under: NestedKey = ()
@@ -353,7 +355,7 @@ class MetaDistillationLoss(KeyedLoss):
         valid = self.valid_rows(tensordict, batch)
         task = entry(tensordict, keys.task, valid)
         check_tasks(keys.task, task, batch, valid)
-        m, points, points_valid = embed(self, tensordict)
+        m, points, points_valid = self._embed(tensordict)
         # M receives the gradients of the chosen terms only.
         reaching = {term: m if term in self.encoder_terms else m.detach() for term in ENCODER_TERMS}
         terms, metrics = {}, {}

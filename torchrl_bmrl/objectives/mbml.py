@@ -21,6 +21,7 @@ from torchrl_bmrl.objectives.contexts import CONTEXT, assign, group_rows
 from torchrl_bmrl.objectives.data import next_key
 from torchrl_bmrl.objectives.distillation import MetaDistillationLoss
 from torchrl_bmrl.objectives.relabel import predict, read_reward
+from torchrl_bmrl.objectives.student_terms import Embedded
 
 
 class MBMLLoss(MetaDistillationLoss):
@@ -195,13 +196,15 @@ class MBMLLoss(MetaDistillationLoss):
 
     # -- contexts --------------------------------------------------------------------------------
 
-    def _embed(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def _embed(self, tensordict: TensorDictBase) -> Embedded:
         rows, valid = self._transitions(tensordict)
         contexts, own, filled = group_rows(rows, self.context_size, valid)
         relabelled, _ = self._relabelled(tensordict, rows, valid)
         both = torch.cat([contexts.get(CONTEXT), relabelled], -1)
         points = self._points(both, rows)
-        return assign(points, own, filled, apart=True), points
+        number = torch.arange(points.shape[1], device=points.device)
+        counts = None if filled is None else number < filled.unsqueeze(-1)
+        return Embedded(assign(points, own, filled, apart=True), points, counts)
 
     def _transitions(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor | None]:
         keys = context_keys(self.task_encoder)

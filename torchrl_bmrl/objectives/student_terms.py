@@ -152,7 +152,7 @@ def encode_previous(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> T
     return loss._encode(tensordict, under=name)
 
 
-def embed(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> Embedded:
+def embedded(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> Embedded:
     """m of each row, and the points that the arranging terms compare."""
     return embed_sets(loss, tensordict) if loss.reads_sets else embed_rows(loss, tensordict)
 

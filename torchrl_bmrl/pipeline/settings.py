@@ -161,8 +161,10 @@ class DistillSettings:
                 needs["context"] = "set or given"
             elif self.batch_size < 2 * self.context_size:
                 needs["batch_size"] = f"at least {2 * self.context_size}, two contexts"
-        elif self.context == "given" or self.inference_updates:
-            needs["task_encoder"] = " or ".join(OF_SETS)
+        else:
+            needs = {"inference_updates": 0} if self.inference_updates else {}
+            if self.context == "given":
+                needs["context"] = "another one, or an encoder of sets"
         if self.task_encoder in ("one_hot", "told", "nothing"):
             needs["isometry_weight"] = 0
             if latent_sources != ["prototype"]:

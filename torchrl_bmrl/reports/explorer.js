@@ -344,10 +344,11 @@
     part("task").parentElement.hidden = true;
     part("episode").parentElement.firstChild.textContent = "Task ";
     part("coloring").replaceChildren(...parameters.map(({ name }, i) => option(name, i)));
-    for (const name of ["episode", "phase", "distance", "success"]) {
+    const filmed = data.episodes.some(hasFrames);
+    part("play").parentElement.hidden = !filmed;
+    for (const name of ["episode", "phase", "distance", "success", ...(filmed ? [] : ["time"])]) {
       const value = part(`show-${name}`);
-      value.previousElementSibling.remove();
-      value.remove();
+      value.hidden = value.previousElementSibling.hidden = true;
     }
     facts.forEach((fact, i) => {
       const [name, value] = [document.createElement("dt"), document.createElement("dd")];

@@ -93,51 +93,49 @@ class Member:
     film: Film | None = None
 
 
-def explore_members(family: Family, members: Sequence[Member], *, note: str = "") -> StoredExplorer:
+def explore_members(
+    family: Family, members: Sequence[Member], *, demonstrations: int = 1, note: str = ""
+) -> StoredExplorer:
     """Draws the members' points m, coloured by their parameter.
 
     Args:
         family: The family.
         members: Members, at least one of them trained. For m of more than two dimensions the first
             two principal components of the trained members' points are drawn.
+        demonstrations: Number of demonstrations that give a point.
         note: Why there are no films.
-
-    Returns:
-        The explorer.
     """
     latents = np.stack([member.task_latent for member in members])
     trained = latents[[member.split == "train" for member in members]]
     points, projection = plane(latents, of=trained)
     axis = "principal component" if "principal" in projection else "m"
-    films = any(member.film and member.film.frames for member in members)
-    described = f"The members of {family.title} in the embedding m"
-    content = {
+    filmed = any(member.film and member.film.frames for member in members)
+    content: dict[str, Any] = {
         "still": True,
-        "description": f"Scatter plot: {described[0].lower()}{described[1:]}, "
-        "coloured by the parameter; the menu Task lists them",
+        "description": f"Scatter plot of the members of {family.title} in the embedding m, "
+        "coloured by their parameter; the menu Task lists them",
         "axes": [f"{axis} 1 (no unit)", f"{axis} 2 (no unit)"],
         "parameters": _parameters(family, members),
         "groups": [{"name": name, "mark": mark} for name, mark in GROUPS.values()],
-        "facts": [*family.parameters, "Member", "Return", "Success"],
+        "facts": [*family.parameters, "Member", *(("Return", "Success") if filmed else ())],
         "tasks": [_task(member) for member in members],
         "note": f"There are no films: {note}" if note else "",
-        "episodes": [
-            _episode(i, float(points[i][0]), float(points[i][1]), member)
-            for i, member in enumerate(members)
-        ],
+        "episodes": [_episode(i, points[i], member) for i, member in enumerate(members)],
     }
-    dims = projection.strip().replace(
+    given = "one demonstration" if demonstrations == 1 else f"{demonstrations} demonstrations"
+    drawn = projection.strip().replace(
         ", its first two principal components",
         "; drawn are the first two principal components of the trained members' points",
     )
     caption = [
-        f"{described}: each point is m of one demonstration, which training did not use.",
-        f"m is {dims}." if dims else "",
-        "Click a point to play one episode of that member: the distilled policy acts with that m. "
-        "The menu Task and the button Play do the same from the keyboard."
-        if films
-        else f"There are no films: {note}",
+        f"The members of {family.title} in the embedding m: each point is the m of {given} that "
+        "training did not use.",
+        f"m is {drawn}." if drawn else "",
         "Colours repeat where the parameter does." if family.period else "",
+        "Click a point to play an episode of that member: the distilled policy acts with this m. "
+        "The menu Task and the button Play do the same from the keyboard."
+        if filmed
+        else content["note"],
     ]
     return StoredExplorer(content=content, caption=" ".join(filter(None, caption)))
 
@@ -148,7 +146,7 @@ def _parameters(family: Family, members: Sequence[Member]) -> list[dict[str, Any
         family.parameters, zip(*(member.parameter for member in members), strict=True), strict=True
     ):
         low, high, period = min(values), max(values), family.period
-        legend = f"{name}: {low:g} to {high:g}"
+        legend = f"{name}: {_number(low)} to {_number(high)}"
         if period:
             low, high, values = 0, period, tuple(value % period for value in values)
             legend = f"{name}: 0 to {period:g}, where it starts again"
@@ -174,7 +172,7 @@ def _task(member: Member) -> dict[str, Any]:
         "group": list(GROUPS).index(member.split),
         "period": film and film.period,
         "facts": [
-            *(f"{value:g}" for value in member.parameter),
+            *map(_number, member.parameter),
             GROUPS[member.split][0],
             MISSING if film is None else f"{film.episode_return:.1f}",
             success,
@@ -182,9 +180,13 @@ def _task(member: Member) -> dict[str, Any]:
     }
 
 
-def _episode(task: int, x: float, y: float, member: Member) -> dict[str, Any]:
+def _number(value: float) -> str:
+    return f"{value:g}".replace("-", "−")
+
+
+def _episode(task: int, point: NDArray[Any], member: Member) -> dict[str, Any]:
     frames = member.film.frames if member.film else {}
     steps = sorted(map(int, frames)) or [0]
-    place = {"x": [float(f"{x:.5g}")] * len(steps), "y": [float(f"{y:.5g}")] * len(steps)}
+    x, y = ([float(f"{value:.5g}")] * len(steps) for value in point)
     unknown = [None] * len(steps)
-    return {"task": task, "step": steps, **place, "distance": unknown, "frames": frames}
+    return {"task": task, "step": steps, "x": x, "y": y, "distance": unknown, "frames": frames}

@@ -7,7 +7,7 @@ of another behaviour, its own first episode, the nearest trained member, or noth
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -127,8 +127,8 @@ def generalise(run: Run, settings: FamilySettings) -> str:
     rows = [row for part in results for row in part]
     write_rows(run.folder / settings.folder / "results.csv", rows)
     table = make_table(family.title, {name: METHODS[name] for name in methods}, rows)
-    heading, explorer = "Tasks that nobody trained on", explore(run, settings)
-    section = Section(heading=heading, tables=[table], explorer=explorer)
+    explorer = explore(run, settings, members) if "demonstration" in methods else None
+    section = Section(heading="Tasks that nobody trained on", tables=[table], explorer=explorer)
     write_study(run.folder, "families", section, {})
     if family.measure is None or "one_hot" not in methods:
         return table.markdown()
@@ -204,15 +204,18 @@ def student_job(run: Run, settings: FamilySettings, method: str) -> StudentJob:
     return StudentJob(distill, f"{settings.folder}/{method}")
 
 
-def explore(run: Run, settings: FamilySettings) -> StoredExplorer:
+def explore(
+    run: Run, settings: FamilySettings, held_out: Sequence[tuple[str, Task]]
+) -> StoredExplorer:
     """All members in the embedding, each with a film if films can be made.
 
     Args:
         run: the run.
         settings: of the study.
+        held_out: members with their splits.
     """
-    note, family = why_no_films(), run.family
-    members = [("train", task) for task in run.tasks] + held_out_members(run)
+    note = why_no_films()
+    members = [*(("train", task) for task in run.tasks), *held_out]
     found = run.jobs(
         look_at_member,
         [(settings, split, task, not note) for split, task in members],
@@ -222,7 +225,7 @@ def explore(run: Run, settings: FamilySettings) -> StoredExplorer:
     )
     if not note and not any(member.film and member.film.frames for member in found):
         note = "the environments of these tasks make no pictures."
-    return explore_members(family, found, note=note)
+    return explore_members(run.family, found, demonstrations=settings.demonstrations, note=note)
 
 
 def look_at_member(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -55,7 +56,7 @@ def film_once(
     """
 
     def make(path: Path) -> None:
-        states: list[Any] = []
+        states: list[NDArray[Any]] = []
 
         def watch(*_: object) -> None:
             if scene is not None:
