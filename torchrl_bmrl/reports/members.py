@@ -181,7 +181,7 @@ def _task(member: Member) -> dict[str, Any]:
 
 
 def _number(value: float) -> str:
-    return f"{value:g}".replace("-", "−")
+    return f"{value:.4g}".replace("-", "−")
 
 
 def _episode(task: int, point: NDArray[Any], member: Member) -> dict[str, Any]:
