@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from explorers import webp
 
+from torchrl_bmrl.families import SPLITS, Family, get_family
 from torchrl_bmrl.reports.explorer import StoredExplorer
 from torchrl_bmrl.reports.members import Film, Member, explore_members
-from torchrl_bmrl.tasks import SPLITS, Family, get_family
 
 
 def film(success: bool | None = True, period: float | None = 0.05) -> Film:

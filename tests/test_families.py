@@ -7,17 +7,9 @@ import pytest
 
 from torchrl_bmrl.envs.hidden import HIDDEN, LiftToHeight, PushTowards, ReachAtSpeed, ReachHidden
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
+from torchrl_bmrl.families import SPLITS, Family, get_family, registered_families, tasks_of
 from torchrl_bmrl.pipeline.task_files import make_tasks
-from torchrl_bmrl.tasks import (
-    SPLITS,
-    DemonstrationFiles,
-    Family,
-    Task,
-    get_family,
-    get_task,
-    registered_families,
-    tasks_of,
-)
+from torchrl_bmrl.tasks import DemonstrationFiles, Task, get_task
 
 SAWYER = tuple(HIDDEN)
 

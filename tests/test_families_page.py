@@ -18,9 +18,9 @@ for extra in ("scipy", "matplotlib", "jinja2", "sklearn"):
 from families import film, lifted, members
 
 from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.families import SPLITS, get_family
 from torchrl_bmrl.reports import Section, Table, read_studies, write_study
 from torchrl_bmrl.reports.members import explore_members, read_film, write_film
-from torchrl_bmrl.tasks import SPLITS, get_family
 
 TABLE = Table(title="T", caption="C", header=("a",), rows=[("1",)])
 
@@ -143,7 +143,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     for needed in ("robosuite", "h5py", "filelock", "safetensors"):
         pytest.importorskip(needed)
     from torchrl_bmrl import pipeline
-    from torchrl_bmrl.tasks import Family, _families, register_family
+    from torchrl_bmrl.families import Family, _families, register_family
 
     lift = get_family("lift_to_height")
     heights = {"train": [(6,), (20,)], "inside": [(12,)], "outside": [(24,)]}

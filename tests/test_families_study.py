@@ -24,7 +24,6 @@ import tiny_family
 from small_runs import contents
 from tiny_family import FAMILY, HORIZON, make_walk
 
-from torchrl_bmrl import tasks
 from torchrl_bmrl.data.robomimic import open_episodes
 from torchrl_bmrl.errors import BMRLError, ConfigError
 from torchrl_bmrl.evaluation import read_results
@@ -43,7 +42,7 @@ HELD_OUT = ("walk_60", "walk_150")
 def family() -> Iterator[None]:
     tiny_family.register()
     yield
-    del tasks._families["walk"]
+    del families._families["walk"]
 
 
 @pytest.fixture(scope="module")

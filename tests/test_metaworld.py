@@ -28,8 +28,9 @@ from torchrl_bmrl.experts.metaworld import (
     make_ml1_task,
     record_ml1_episode,
 )
+from torchrl_bmrl.families import get_family, tasks_of
 from torchrl_bmrl.run.workers import derive_seed
-from torchrl_bmrl.tasks import get_family, get_task, tasks_of
+from torchrl_bmrl.tasks import get_task
 
 pytestmark = pytest.mark.metaworld
 

@@ -14,13 +14,13 @@ pytest.importorskip("h5py")
 
 from torchrl_bmrl import tasks
 from torchrl_bmrl.errors import ConfigError, UnknownNameError
+from torchrl_bmrl.families import registered_families
 from torchrl_bmrl.tasks import (
     DemonstrationFiles,
     Task,
     compose_tasks,
     get_task,
     register_task,
-    registered_families,
     registered_tasks,
 )
 

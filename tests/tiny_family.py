@@ -15,8 +15,9 @@ from torchrl.envs import EnvBase
 
 from torchrl_bmrl import pipeline
 from torchrl_bmrl.data.episodes import Episode
+from torchrl_bmrl.families import Family, register_family
 from torchrl_bmrl.run.workers import derive_seed
-from torchrl_bmrl.tasks import Family, Task, register_family
+from torchrl_bmrl.tasks import Task
 
 HORIZON = 6
 

@@ -2,9 +2,6 @@
 
 A :class:`Task` is a value. :func:`register_task` gives it a name that settings, recipes and
 :func:`get_task` accept. The six Sawyer tasks of this package register themselves the same way.
-
-A :class:`Family` is a set of tasks that differ in a parameter which the observation does not show.
-:func:`register_family` gives it a name that settings accept in place of its trained members.
 """
 
 from __future__ import annotations
@@ -18,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 from torchrl_bmrl.errors import ConfigError, UnknownNameError
 
 if TYPE_CHECKING:
-    from torch import Tensor
     from torchrl.envs import EnvBase
     from torchrl.envs.transforms import Transform
 
@@ -30,7 +26,7 @@ OWN_TASKS = (
     "torchrl_bmrl.experts.metaworld",
 )
 """Modules that register this package's own tasks; they are imported when a name is looked up."""
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.]*")
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.]*")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +97,7 @@ class Task:
 
     def __post_init__(self) -> None:
         parts = self.stages if self.compose else (self.name,)
-        if not all(_NAME.fullmatch(part) for part in parts):
+        if not all(NAME.fullmatch(part) for part in parts):
             raise ConfigError(f"a task's name is {self.name!r}; valid: letters, digits, _ and .")
         if (self.record is None) == (self.files is None):
             raise ConfigError(f"task {self.name} needs demonstrations; valid: record or files")
@@ -133,126 +129,12 @@ class Task:
         return replace(self, options={**self.options, **options})
 
 
-SPLITS = ("train", "inside", "outside")
-"""Trained members of a family; members held out within the trained range; and beyond it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Family:
-    """Tasks that differ in a parameter which the observation does not show.
-
-    Attributes:
-        name: letters, digits, ``_`` and ``.``.
-        parameters: name and unit of each number of a member's parameter, for tables and figures.
-        members: the parameters of the members, one tuple of numbers each, by split: ``"train"``,
-            ``"inside"`` (held out, within the trained range) and ``"outside"`` (held out, beyond
-            it).
-        make: ``make(*parameter)`` returns a member's :class:`Task`; equal parameters give equal
-            names.
-        code: ``code(*parameter)`` returns the numbers that a policy is given which is told the
-            parameter; ``None``: the parameter, scaled to [-1, 1] over the trained members.
-        period: after which a parameter repeats, such as 360 for a direction; ``None``: never.
-        measure: returns the parameter that an episode looks like, from its observations
-            ``(T, obs_dim)``, not normalised; ``None``: the family has no such measure.
-        title: name in tables and figures; by default the name with spaces for underscores.
-
-    Raises:
-        ConfigError: for a name that is not valid, a missing split or no trained member, a
-            parameter of another length, or the same parameter twice.
-
-    Example:
-        >>> def make(angle):
-        ...     return Task(name=f"turn_{angle}", files=DemonstrationFiles(path=f"{angle}.hdf5"))
-        >>> members = {"train": [(0,), (90,)], "inside": [(45,)], "outside": [(120,)]}
-        >>> family = Family(name="turn", parameters=("angle [°]",), members=members, make=make)
-        >>> [task.name for task in family.tasks("train")], family.told("turn_45")
-        (['turn_0', 'turn_90'], (0.0,))
-    """
-
-    name: str
-    parameters: tuple[str, ...]
-    members: Mapping[str, Sequence[tuple[float, ...]]]
-    make: Callable[..., Task]
-    code: Callable[..., tuple[float, ...]] | None = None
-    period: float | None = None
-    measure: Callable[[Tensor], tuple[float, ...]] | None = None
-    title: str = ""
-
-    def __post_init__(self) -> None:
-        if not _NAME.fullmatch(self.name):
-            raise ConfigError(f"a family's name is {self.name!r}; valid: letters, digits, _ and .")
-        if tuple(self.members) != SPLITS or not self.members["train"]:
-            raise ConfigError(
-                f"members of family {self.name} are {', '.join(self.members) or 'missing'}; valid: "
-                f"{', '.join(SPLITS)}, in this order, with at least one in train"
-            )
-        size = len(self.parameters)
-        for parameter in self.all():
-            if len(parameter) != size:
-                raise ConfigError(
-                    f"a member of family {self.name} is {parameter}; valid: {size} numbers"
-                )
-        if len(set(self.all())) < len(self.all()):
-            twice = next(x for i, x in enumerate(self.all()) if x in self.all()[:i])
-            raise ConfigError(
-                f"members of family {self.name} contain {twice} twice; valid: each parameter once, "
-                "in one split"
-            )
-        if not self.title:
-            object.__setattr__(self, "title", self.name.replace("_", " ").capitalize())
-
-    def all(self) -> list[tuple[float, ...]]:
-        """Parameters of all members."""
-        return [tuple(parameter) for split in SPLITS for parameter in self.members[split]]
-
-    def tasks(self, split: str) -> tuple[Task, ...]:
-        """Tasks of the members of one split.
-
-        Args:
-            split: one of :data:`SPLITS`.
-
-        Raises:
-            UnknownNameError: for another split.
-        """
-        if split not in SPLITS:
-            raise UnknownNameError("split of a family", split, SPLITS)
-        return tuple(self.make(*parameter) for parameter in self.members[split])
-
-    def parameter(self, task: str) -> tuple[float, ...]:
-        """Parameter of a member.
-
-        Args:
-            task: the name of the member's task.
-
-        Raises:
-            UnknownNameError: if no member has that name.
-        """
-        names = {self.make(*parameter).name: parameter for parameter in self.all()}
-        if task not in names:
-            raise UnknownNameError(f"member of family {self.name}", task, tuple(names))
-        return names[task]
-
-    def told(self, task: str) -> tuple[float, ...]:
-        """Numbers that a policy is given which is told a member's parameter.
-
-        Args:
-            task: the name of the member's task.
-        """
-        parameter = self.parameter(task)
-        if self.code is not None:
-            return self.code(*parameter)
-        columns = zip(parameter, *self.members["train"], strict=True)
-        return tuple(
-            (2 * value - min(trained) - max(trained)) / ((max(trained) - min(trained)) or 1)
-            for value, *trained in columns
-        )
-
-
 _registry: dict[str, Task] = {}
-_families: dict[str, Family] = {}
+_members: dict[str, Callable[[str], Task | None]] = {}
 
 
-def _register_own() -> None:
+def register_own_tasks() -> None:
+    """Imports the modules that register this package's own tasks and families."""
     for module in OWN_TASKS:
         importlib.import_module(module)
 
@@ -275,73 +157,17 @@ def register_task(task: Task) -> Task:
     return task
 
 
-def register_family(family: Family) -> Family:
-    """Makes a family and its members known by name; a later family of the same name replaces it.
+def register_members(family: str, find: Callable[[str], Task | None]) -> None:
+    """Makes the members of a family known by their names, which begin with the family's.
 
     Args:
-        family: the family.
-
-    Returns:
-        the same family.
+        family: name of the family.
+        find: returns the member of a name, ``None`` if there is none.
 
     Example:
-        >>> get_family("push_towards").parameters
-        ('direction [°]',)
+        >>> register_members("knocks", lambda name: None)
     """
-    _families[family.name] = family
-    return family
-
-
-def registered_families() -> tuple[str, ...]:
-    """Names of the registered families, in the order of registration.
-
-    Example:
-        >>> registered_families()[:2]
-        ('push_towards', 'reach_hidden')
-    """
-    _register_own()
-    return tuple(_families)
-
-
-def get_family(name: str) -> Family:
-    """The family of a name.
-
-    Args:
-        name: a registered name; or ``"module:name"``, where importing the module registers it.
-
-    Raises:
-        UnknownNameError: if no such family is registered.
-        ConfigError: if the module cannot be imported.
-
-    Example:
-        >>> len(get_family("push_towards").tasks("inside"))
-        9
-    """
-    rest = _imported("family", name)
-    known = registered_families()
-    if rest not in known:
-        raise UnknownNameError("family", rest, known)
-    return _families[rest]
-
-
-def tasks_of(name: str) -> tuple[Task, ...]:
-    """The task of a name, or the trained members of a family.
-
-    Args:
-        name: as for :func:`get_task`, or for :func:`get_family`.
-
-    Raises:
-        UnknownNameError: if there is neither such a task nor such a family.
-        ConfigError: as :func:`get_task`.
-
-    Example:
-        >>> [task.name for task in tasks_of("push_towards")][:2]
-        ['push_towards_0', 'push_towards_30']
-    """
-    rest = _imported("task", name)
-    if rest in registered_families():
-        return _families[rest].tasks("train")
-    return (get_task(name),)
+    _members[family] = find
 
 
 def registered_tasks() -> tuple[str, ...]:
@@ -351,7 +177,7 @@ def registered_tasks() -> tuple[str, ...]:
         >>> registered_tasks()[:3]
         ('reach', 'lift', 'push_right')
     """
-    _register_own()
+    register_own_tasks()
     return tuple(_registry)
 
 
@@ -372,18 +198,36 @@ def get_task(name: str) -> Task:
         >>> get_task("reach-lift-reach").horizon
         300
     """
-    rest = _imported("task", name)
+    rest = import_module_of("task", name)
     known = registered_tasks()
     parts = [rest] if rest in known else rest.split("-")
-    tasks = {part: _registry.get(part) or _member(part) for part in parts}
-    for part, task in tasks.items():
-        if task is None:
-            raise UnknownNameError("task", part, (*known, *registered_families()))
-    return compose_tasks([task for part in parts if (task := tasks[part]) is not None])
+    return compose_tasks([_find(part, known) for part in parts])
 
 
-def _imported(what: str, name: str) -> str:
-    """Imports the module of ``module:name``; returns the name."""
+def _find(name: str, known: tuple[str, ...]) -> Task:
+    """Returns the task or the member of a family with a name."""
+    for family, find in _members.items():
+        if name not in known and name.startswith(family) and (task := find(name)) is not None:
+            return task
+    if name not in known:
+        raise UnknownNameError("task", name, (*known, *_members))
+    return _registry[name]
+
+
+def import_module_of(what: str, name: str) -> str:
+    """Imports the module of ``module:name``; returns the name.
+
+    Args:
+        what: what has the name, for the message.
+        name: with or without a module.
+
+    Raises:
+        ConfigError: if the module cannot be imported.
+
+    Example:
+        >>> import_module_of("task", "torchrl_bmrl.experts.tabletop:lift")
+        'lift'
+    """
     module, colon, rest = name.rpartition(":")
     if colon:
         try:
@@ -391,16 +235,6 @@ def _imported(what: str, name: str) -> str:
         except ImportError as error:
             raise ConfigError(f"{what} {name}: {module} cannot be imported ({error})") from error
     return rest
-
-
-def _member(name: str) -> Task | None:
-    """Returns the member of a family by its name, if there is one."""
-    for family in _families.values():
-        if name.startswith(family.name):
-            for parameter in family.all():
-                if (task := family.make(*parameter)).name == name:
-                    return task
-    return None
 
 
 def compose_tasks(tasks: Sequence[Task]) -> Task:

@@ -19,8 +19,9 @@ from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.experts.controllers import ExpertGains
 from torchrl_bmrl.extras import needs
+from torchrl_bmrl.families import Family, register_family, registered_families
 from torchrl_bmrl.run.workers import derive_seed
-from torchrl_bmrl.tasks import Family, Task, register_family, registered_families
+from torchrl_bmrl.tasks import Task
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase

@@ -29,7 +29,8 @@ from torchrl_bmrl.experts.controllers import (
     ReachExpert,
 )
 from torchrl_bmrl.experts.tabletop import make_task
-from torchrl_bmrl.tasks import Family, Task, register_family
+from torchrl_bmrl.families import Family, register_family
+from torchrl_bmrl.tasks import Task
 
 LEAD = 0.12
 """The expert aims at where the end-effector should be in this time, since the arm lags [s]."""

@@ -25,6 +25,7 @@ from torchrl_bmrl.envs.gym import max_episode_steps
 from torchrl_bmrl.envs.transforms import ObservationStatistics, make_env
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome, evaluate_policy
+from torchrl_bmrl.families import Family, get_family, registered_families
 from torchrl_bmrl.objectives import BCQLoss
 from torchrl_bmrl.pipeline.agents import load_bcq_loss
 from torchrl_bmrl.pipeline.settings import SIX_TASKS, Settings
@@ -38,13 +39,7 @@ from torchrl_bmrl.pipeline.task_files import (
 )
 from torchrl_bmrl.run.locks import lock_run
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
-from torchrl_bmrl.tasks import (
-    Family,
-    Task,
-    compose_tasks,
-    get_family,
-    registered_families,
-)
+from torchrl_bmrl.tasks import Task, compose_tasks
 
 log = logging.getLogger(__name__)
 

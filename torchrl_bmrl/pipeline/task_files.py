@@ -13,9 +13,10 @@ from typing import Any
 from torchrl_bmrl.data.options import ReadOptions
 from torchrl_bmrl.envs.gym import make_gym_env
 from torchrl_bmrl.errors import BMRLError, ConfigError
+from torchrl_bmrl.families import tasks_of
 from torchrl_bmrl.pipeline.settings import Settings
 from torchrl_bmrl.run.folder import read_yaml
-from torchrl_bmrl.tasks import DemonstrationFiles, Task, get_task, tasks_of
+from torchrl_bmrl.tasks import DemonstrationFiles, Task, get_task
 
 
 def _is_text(x: Any) -> bool:
@@ -79,8 +80,8 @@ def make_tasks(tasks: Sequence[str] | Mapping[str, Mapping[str, Any]]) -> tuple[
     """Returns the tasks that the settings describe.
 
     Args:
-        tasks: names of tasks and families (:func:`~torchrl_bmrl.tasks.tasks_of`), or descriptions
-            by name as in a :func:`read_task_file`.
+        tasks: names of tasks and families (:func:`~torchrl_bmrl.families.tasks_of`), or
+            descriptions by name as in a :func:`read_task_file`.
 
     Returns:
         the tasks in their order; a task's class index is its position.

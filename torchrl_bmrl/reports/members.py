@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.extras import needs
+from torchrl_bmrl.families import Family
 from torchrl_bmrl.files import read_json, write_atomic
 from torchrl_bmrl.reports.drawing import plane
 from torchrl_bmrl.reports.explorer import StoredExplorer
 from torchrl_bmrl.reports.tables import MISSING
-from torchrl_bmrl.tasks import Family
 
 with needs("reports"):
     from matplotlib import colormaps

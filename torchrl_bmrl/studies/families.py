@@ -24,6 +24,7 @@ from torchrl_bmrl.envs.transforms import transform_data
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
 from torchrl_bmrl.experts.collect import WANDERING, others_than
+from torchrl_bmrl.families import SPLITS
 from torchrl_bmrl.files import number, read_rows, whole, write_rows
 from torchrl_bmrl.modules import BCQPolicy, PathTaskLatent, reads_context
 from torchrl_bmrl.modules.task_latent import check_reads_transitions
@@ -42,7 +43,7 @@ from torchrl_bmrl.studies.families_films import film_once, why_no_films
 from torchrl_bmrl.studies.families_line import LINES, POINTS, line_table, lines_of, play_line
 from torchrl_bmrl.studies.families_report import make_table
 from torchrl_bmrl.studies.imitation import clone_behaviour
-from torchrl_bmrl.tasks import SPLITS, Task
+from torchrl_bmrl.tasks import Task
 
 HELD_OUT = SPLITS[1:]
 METHODS = {
