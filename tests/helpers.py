@@ -12,13 +12,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import nn
 from torchrl.modules import MLP
 
 from torchrl_bmrl.errors import BMRLError
@@ -380,34 +379,3 @@ def guide(name: str = "extending") -> ModuleType:
         sys.modules[name] = module = ModuleType(name)
         exec(compile("\n".join(blocks), page.name, "exec"), vars(module))
     return sys.modules[name]
-
-
-# -- networks, recorded and recomputed -------------------------------------------------------------
-
-
-def recorded(module: nn.Module) -> list[tuple[tuple[Tensor, ...], Tensor]]:
-    """Inputs and output of every later call of a module."""
-    calls: list[tuple[tuple[Tensor, ...], Tensor]] = []
-    module.register_forward_hook(
-        lambda _, inputs, output: calls.append(
-            (tuple(x.detach().clone() for x in inputs), output.detach().clone())
-        )
-    )
-    return calls
-
-
-def numpy_mlp(parameters: Any, *inputs: Any) -> np.ndarray:
-    """A ReLU network in plain numpy, from a tensordict of its layers' weights and biases."""
-    x = np.concatenate([np.asarray(value) for value in inputs], -1)
-    layers = sorted(parameters.keys(), key=int)
-    for layer in layers:
-        weight = parameters[layer, "weight"].detach().numpy()
-        x = x @ weight.T + parameters[layer, "bias"].detach().numpy()
-        if layer != layers[-1]:
-            x = np.maximum(x, 0.0)
-    return x
-
-
-def numpy_decoder(parameters: Any, *inputs: Any) -> np.ndarray:
-    """A decoder with bounds of ±1 in plain numpy."""
-    return np.tanh(numpy_mlp(parameters["module", "network"], *inputs))

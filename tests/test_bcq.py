@@ -16,13 +16,11 @@ from helpers import (
     make_bcq_loss,
     make_critics,
     make_generator,
-    numpy_decoder,
-    numpy_mlp,
-    recorded,
     run,
     transitions,
     undeclare,
 )
+from recomputed import numpy_decoder, numpy_mlp, recorded
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""Episodes in which other members' experts act: who acts, and what is refused."""
+"""Episodes of another behaviour, which contexts are drawn from."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import pytest
 
 pytest.importorskip("h5py")
 pytest.importorskip("tqdm")
-pytest.importorskip("yaml")
 
 from tiny_family import FAMILY, make_walk
 

@@ -13,10 +13,10 @@ from helpers import (
     as_keywords,
     discrete_transitions,
     make_discrete_bcq_loss,
-    numpy_mlp,
     run,
     state,
 )
+from recomputed import numpy_mlp
 from tensordict import TensorDict
 
 from torchrl_bmrl.errors import BMRLError

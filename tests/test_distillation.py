@@ -14,14 +14,12 @@ from helpers import (
     make_distillation_loss,
     make_student_networks,
     make_teachers,
-    numpy_decoder,
-    numpy_mlp,
     reached,
-    recorded,
     run,
     task_transitions,
     total,
 )
+from recomputed import numpy_decoder, numpy_mlp, recorded
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor

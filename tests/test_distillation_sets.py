@@ -14,13 +14,13 @@ from helpers import (
     TASKS,
     distillation_networks,
     reached,
-    recorded,
     run,
     set_networks,
     set_transitions,
     task_transitions,
     total,
 )
+from recomputed import recorded
 from tensordict import TensorDict, unravel_key
 from tensordict.nn import TensorDictModule
 

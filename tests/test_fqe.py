@@ -20,10 +20,10 @@ from helpers import (
     make_fqe_loss,
     make_plas_loss,
     make_policy,
-    numpy_mlp,
     run,
     transitions,
 )
+from recomputed import numpy_mlp
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn

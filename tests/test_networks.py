@@ -12,10 +12,10 @@ from helpers import (
     LATENT_DIM,
     OBSERVATION_DIM,
     TASK_LATENT_DIM,
-    numpy_mlp,
     observations,
     transitions,
 )
+from recomputed import numpy_mlp
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn

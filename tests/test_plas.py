@@ -13,14 +13,12 @@ from helpers import (
     NO_UPDATER,
     OBSERVATION_DIM,
     make_plas_loss,
-    numpy_decoder,
-    numpy_mlp,
-    recorded,
     run,
     state,
     transitions,
     undeclare,
 )
+from recomputed import numpy_decoder, numpy_mlp, recorded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_bmrl.modules import PLASPolicy, make_latent_actor

@@ -15,15 +15,14 @@ from helpers import (
     OBSERVATION_DIM,
     TASK_LATENT_DIM,
     make_bcq_loss,
-    numpy_mlp,
     observations,
-    recorded,
     state,
     total,
     transitions,
     undeclare,
     undeclared,
 )
+from recomputed import numpy_mlp, recorded
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn

@@ -293,7 +293,6 @@ def test_given_contexts_are_of_the_row_s_task_and_of_both_behaviours() -> None:
         shares.append((reward >= 100).float().mean(1))
     share = torch.stack(shares).flatten()
     assert 0.4 < share.mean() < 0.6
-    # Contexts of one behaviour, of the other, and mixed.
     assert share.min() < 0.1
     assert share.max() > 0.9
     assert ((share > 0.3) & (share < 0.7)).any()
