@@ -306,12 +306,7 @@ def test_other_contexts_add_nothing_to_a_batch() -> None:
 
 # -- settings --------------------------------------------------------------------------------------
 
-SETS = {
-    "task_encoder": "set_mean",
-    "context_fraction": 1.0,
-    "isometry_weight": 0.0,
-    "inference_updates": 0,
-}
+SETS = {"task_encoder": "set_mean", "context_fraction": 1.0, "isometry_weight": 0.0}
 
 
 @pytest.mark.parametrize(
