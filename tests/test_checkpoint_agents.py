@@ -129,7 +129,7 @@ def test_settings_of_no_networks_are_refused_before_any_are_made(
         ("latent_clip", "0.5"),
         ("latent_clip", float("nan")),
         ("accuracy", 2),
-        ("accuracy", None),
+        ("accuracy", "1"),
         ("statistics", {"loc": [0.0], "scale": [1.0, 2.0]}),
         ("statistics", {"loc": [0.0], "scale": [0.0]}),
         ("statistics", {"loc": ["0"], "scale": [1.0]}),

@@ -35,6 +35,7 @@ from torchrl_bmrl.modules import (
     ActionVAE,
     BCQPolicy,
     EnsembleCritic,
+    as_context,
     make_qvalue_network,
 )
 
@@ -57,11 +58,15 @@ BASES = {"KeyedLoss", "OfflineLoss", "GenerativeLoss"}
 LOSSES = sorted(set(objectives.__all__) - BASES)
 GROUP = {
     "bcq": "BCQLoss",
+    "context_inference": "ContextInferenceLoss",
     "discrete_bcq": "DiscreteBCQLoss",
+    "focal": "FOCALLoss",
     "fqe": "FQELoss",
+    "mbml": "MBMLLoss",
     "meta_distillation": "MetaDistillationLoss",
     "plas": "PLASLoss",
     "rebrac": "ReBRACLoss",
+    "reward_model": "RewardModelLoss",
     "stacked": "StackedLoss",
 }
 SIZES = {"observation_dim": OBSERVATION_DIM, "action_dim": ACTION_DIM}
@@ -84,7 +89,35 @@ TORCHRL_CRITIC = torchrl(
     ["observation", "action"], "state_action_value", OBSERVATION_DIM + ACTION_DIM, 1
 )
 STUDENT = {"task_latent_dim": TASK_LATENT_DIM, "num_cells": list(CELLS)}
+SET_ENCODER = ours("make_context_encoder", **SIZES, **STUDENT)
+STUDENTS = {
+    "student_generator": ours("make_decoder", **SIZES, latent_dim=LATENT_DIM, **STUDENT),
+    "student_qvalue_network": ours("make_qvalue_network", **SIZES, **STUDENT),
+    "teacher_generators": [ours("make_decoder", **SIZES, latent_dim=LATENT_DIM)] * 2,
+    "teacher_qvalue_networks": [CRITIC, CRITIC],
+    "latent_dim": LATENT_DIM,
+}
+REWARD_MODELS = ours("make_reward_models", num_tasks=2, **SIZES)
 NETWORKS: dict[str, dict[str, Any]] = {
+    "ContextInferenceLoss": {
+        "context_encoder": SET_ENCODER,
+        "task_latents": [[0.0] * TASK_LATENT_DIM, [1.0] * TASK_LATENT_DIM],
+    },
+    "FOCALLoss": {
+        "task_encoder": SET_ENCODER,
+        "actor_network": ours("make_gaussian_actor", **SIZES, **STUDENT),
+        "divergence_network": ours("make_qvalue_network", **SIZES, **STUDENT),
+        "qvalue_network": ours("make_qvalue_network", **SIZES, **STUDENT),
+        "bounds": [-1.0, 1.0],
+        "context_size": 2,
+    },
+    "MBMLLoss": {
+        "task_encoder": SET_ENCODER,
+        "reward_models": REWARD_MODELS,
+        "context_size": 2,
+        **STUDENTS,
+    },
+    "RewardModelLoss": {"reward_models": REWARD_MODELS},
     "BCQLoss": {"generator": GENERATOR, "qvalue_network": [CRITIC, CRITIC], "bounds": [-1, 1]},
     "DiscreteBCQLoss": {
         "generator": torchrl(["observation"], "logits", OBSERVATION_DIM, NUM_ACTIONS),
@@ -97,11 +130,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "MetaDistillationLoss": {
         "task_encoder": ours("make_task_encoder", **SIZES, **STUDENT),
         "task_classifier": ours("make_task_classifier", num_tasks=2),
-        "student_generator": ours("make_decoder", **SIZES, latent_dim=LATENT_DIM, **STUDENT),
-        "student_qvalue_network": ours("make_qvalue_network", **SIZES, **STUDENT),
-        "teacher_generators": [ours("make_decoder", **SIZES, latent_dim=LATENT_DIM)] * 2,
-        "teacher_qvalue_networks": [CRITIC, CRITIC],
-        "latent_dim": LATENT_DIM,
+        **STUDENTS,
         "qvalue_loc": [0.0, 1.0],
         "encoder_terms": ["classification", "qvalue"],
     },
@@ -136,6 +165,10 @@ NETWORKS: dict[str, dict[str, Any]] = {
     },
 }
 DATA = {
+    "ContextInferenceLoss": lambda: as_context(transitions(2, 3, 4, dtype=torch.float32)),
+    "FOCALLoss": lambda: task_transitions(2, 4, dtype=torch.float32),
+    "MBMLLoss": lambda: task_transitions(2, 4, dtype=torch.float32),
+    "RewardModelLoss": lambda: task_transitions(2, 4, dtype=torch.float32),
     "BCQLoss": lambda: transitions(4, dtype=torch.float32),
     "DiscreteBCQLoss": lambda: discrete_transitions(4, dtype=torch.float32),
     "FQELoss": lambda: transitions(4, dtype=torch.float32),

@@ -87,20 +87,24 @@ def test_stage_1_killed_between_two_files_goes_on_to_the_same_ones(
 def test_stage_2_resumed_equals_never_stopped(
     finished: Path, tmp_path: Path, update: int, kept: int | None
 ) -> None:
-    from torchrl_bmrl.pipeline.stage2 import train_student
+    from torchrl_bmrl.pipeline.stage2 import StudentJob, train_student
 
     for name in ("data", "bcq"):
         shutil.copytree(finished / name, tmp_path / name)
     made = make_run(tmp_path)
     checkpoint = tmp_path / "distill" / "checkpoint.safetensors"
+    job = StudentJob(made.settings.distill, "distill")
     with pytest.raises(KeyboardInterrupt):
-        train_student((made, None), Interruption(update, KeyboardInterrupt))
+        train_student(
+            (made, StudentJob(made.settings.distill, "distill")),
+            Interruption(update, KeyboardInterrupt),
+        )
     if kept is None:
         assert not checkpoint.exists()
     else:
         assert load_checkpoint(checkpoint, kind="student")[1]["updates"] == kept
     counted: list[int] = []
-    train_student((made, None), counted.append)
+    train_student((made, job), counted.append)
     assert counted == ([kept] if kept else []) + [1] * (12 - (kept or 0))
     # The teachers' files are unchanged too.
     stages = ("bcq/*/*", "distill/*", "logs/distill/scalars/*")

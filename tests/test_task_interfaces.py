@@ -20,6 +20,7 @@ from scene_state import DIRECTIONS, TASKS, simulator
 from torchrl.envs.utils import check_env_specs
 
 import torchrl_bmrl.envs  # registers the ids  # noqa: F401
+from torchrl_bmrl.envs.hidden import HIDDEN
 from torchrl_bmrl.envs.registration import gymnasium_id
 from torchrl_bmrl.envs.robosuite_names import robosuite_metadata
 from torchrl_bmrl.envs.scene import TabletopScene
@@ -43,7 +44,8 @@ IDS = {
 def test_the_ids_are_those_of_the_tasks_and_one_for_compositions() -> None:
     assert {task: gymnasium_id(task) for task in TASKS} == IDS
     registered = {i for i in gymnasium.registry if i.startswith("bmrl/")}
-    assert registered == {*IDS.values(), "bmrl/SawyerComposition-v0"}
+    families = {gymnasium_id(family) for family in HIDDEN}
+    assert registered == {*IDS.values(), "bmrl/SawyerComposition-v0", *families}
     env = gymnasium.make("bmrl/SawyerComposition-v0")
     assert env.unwrapped.task == "reach-lift-reach"
     env.close()

@@ -29,11 +29,15 @@ with needs("recipes"):
 
 __all__ = [
     "BCQLossConfig",
+    "ContextInferenceLossConfig",
     "DiscreteBCQLossConfig",
+    "FOCALLossConfig",
     "FQELossConfig",
+    "MBMLLossConfig",
     "MetaDistillationLossConfig",
     "PLASLossConfig",
     "ReBRACLossConfig",
+    "RewardModelLossConfig",
     "StackedLossConfig",
 ]
 
@@ -82,9 +86,13 @@ def _configuration(loss: type) -> Any:
 
 
 BCQLossConfig = _configuration(objectives.BCQLoss)
+ContextInferenceLossConfig = _configuration(objectives.ContextInferenceLoss)
 DiscreteBCQLossConfig = _configuration(objectives.DiscreteBCQLoss)
+FOCALLossConfig = _configuration(objectives.FOCALLoss)
 FQELossConfig = _configuration(objectives.FQELoss)
+MBMLLossConfig = _configuration(objectives.MBMLLoss)
 MetaDistillationLossConfig = _configuration(objectives.MetaDistillationLoss)
 PLASLossConfig = _configuration(objectives.PLASLoss)
 ReBRACLossConfig = _configuration(objectives.ReBRACLoss)
+RewardModelLossConfig = _configuration(objectives.RewardModelLoss)
 StackedLossConfig = _configuration(objectives.StackedLoss)

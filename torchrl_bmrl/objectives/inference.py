@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -69,17 +71,20 @@ class ContextInferenceLoss(KeyedLoss):
     target_context_encoder_params: TensorDictParams
 
     def __init__(
-        self, context_encoder: TensorDictModule, task_latents: Tensor, **options: object
+        self,
+        context_encoder: TensorDictModule,
+        task_latents: Tensor | Sequence[Sequence[float]],
+        **options: Any,
     ) -> None:
-        super().__init__(**options)  # type: ignore[arg-type]
+        super().__init__(**options)
         check_network("context_encoder", context_encoder)
         context_keys(context_encoder)
-        if task_latents.ndim != 2:
+        points = torch.as_tensor(task_latents).detach().clone()
+        if points.ndim != 2:
             raise BMRLError(
-                f"task_latents is of shape {tuple(task_latents.shape)}; valid: (num_tasks, m)"
+                f"task_latents is of shape {tuple(points.shape)}; valid: (num_tasks, m)"
             )
         self.convert_to_functional(context_encoder, "context_encoder", create_target_params=False)
-        points = task_latents.detach().clone()
         spread = (points - points.mean(0)).square().sum(-1).mean()
         self.register_buffer("task_latents", points)
         self.register_buffer("scale", nonzero_scale(spread, points.abs().max(), points.dtype))

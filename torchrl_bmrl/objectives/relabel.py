@@ -41,6 +41,7 @@ class RewardModelLoss(KeyedLoss):
         BMRLError: at a call for data that do not fit.
 
     Example:
+        >>> import torch
         >>> from torchrl_bmrl.modules import extract_network, make_reward_models
         >>> loss = RewardModelLoss(make_reward_models(4, 3, 2))
         >>> data = {"observation": torch.randn(4, 8, 3), "action": torch.randn(4, 8, 2)}
