@@ -95,10 +95,7 @@ def test_stage_2_resumed_equals_never_stopped(
     checkpoint = tmp_path / "distill" / "checkpoint.safetensors"
     job = StudentJob(made.settings.distill, "distill")
     with pytest.raises(KeyboardInterrupt):
-        train_student(
-            (made, StudentJob(made.settings.distill, "distill")),
-            Interruption(update, KeyboardInterrupt),
-        )
+        train_student((made, job), Interruption(update, KeyboardInterrupt))
     if kept is None:
         assert not checkpoint.exists()
     else:
