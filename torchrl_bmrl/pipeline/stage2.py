@@ -142,7 +142,8 @@ def make_sampler(
     Args:
         run: the run.
         distill: settings of stage 2. With ``context="given"`` each row has a transition under
-            ``"context"``, half of them of another behaviour if the demonstrations have any.
+            ``"context"``: in a third of the batches a task's are demonstrations alone, in a third
+            another behaviour's alone, in the others both.
         train: the demonstrations, ``[N_i]`` each.
     """
     options: dict[str, Any] = {"batch_size": distill.batch_size, "device": run.settings.device}
@@ -154,8 +155,7 @@ def make_sampler(
     buffers = [make_multi_task_replay_buffer(data, **options) for data in (own, others)]
 
     def sample() -> TensorDictBase:
-        # A third of the contexts are of one behaviour alone, a third of the other: with a single
-        # demonstrated transition the encoder would not have to look at rewards.
+        # With a single demonstrated transition the encoder does not have to look at rewards.
         first, second = (contexts.sample().exclude("index") for contexts in buffers)
         share = (3 * torch.rand(len(train), 1, device=first.device) - 1).clamp(0, 1)
         chosen = torch.rand(first.batch_size, device=first.device) < share
@@ -220,7 +220,6 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
     end = distill.updates + distill.inference_updates
     if done == end:
         return
-    inference: Inference | None = None
 
     def update(batch: TensorDictBase) -> dict[str, Tensor]:
         losses = loss(batch)
@@ -236,13 +235,6 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
     )
 
     def step(number: int, batch: TensorDictBase) -> dict[str, Tensor]:
-        nonlocal inference
-        if number > distill.updates:
-            if inference is None:
-                here = [data.to(settings.device) for data in train]
-                student.set_prototypes(here, distill.prototype)
-                inference = Inference(student, optimizers["inference"], distill, train, others)
-            return inference.step(number - distill.updates)
         if distill.cosine:
             decay(optimizers["student"], distill.lr, number, distill.updates)
         return accelerated(batch.select(*loss.in_keys))
@@ -255,6 +247,12 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
         some = batch[:, :32]
         proposed = proposals(student, some, teachers[0].latent_clip, settings.device)
         check_proposals(proposed, some["action"], where)
+        log_metrics(logger if logging else None, metrics, number)
+
+    def check_inference(
+        number: int, metrics: dict[str, Tensor], batch: TensorDictBase, logging: bool
+    ) -> None:
+        check_metrics(metrics, f"inference of m, update {number}")
         log_metrics(logger if logging else None, metrics, number)
 
     def save(number: int) -> None:
@@ -288,16 +286,26 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
             settings.logger, run.folder, student_job.folder.replace("/", "_"), done
         )
         stack.callback(close_logger, logger)
-        fit(
-            step,
-            sample,
-            start=done,
-            total=end,
-            every=Every(log=settings.log_interval, save=settings.checkpoint_interval),
-            check=check,
-            save=save,
-            report=report,
-        )
+        options_of_fit: dict[str, Any] = {
+            "every": Every(log=settings.log_interval, save=settings.checkpoint_interval),
+            "save": save,
+            "report": report,
+        }
+        if done < distill.updates:
+            fit(step, sample, start=done, total=distill.updates, check=check, **options_of_fit)
+        if distill.inference_updates:
+            here = [data.to(settings.device) for data in train]
+            student.set_prototypes(here, distill.prototype)
+            inference = Inference(student, optimizers["inference"], distill, train, others)
+            start = max(done, distill.updates)
+            fit(
+                inference.step,
+                inference.sample,
+                start=start,
+                total=end,
+                check=check_inference,
+                **options_of_fit,
+            )
 
 
 class Inference:
@@ -324,12 +332,12 @@ class Inference:
         self.loss = ContextInferenceLoss(student.context_encoder, student.prototypes)
         self.sample = ContextSampler(train, others, distill.context_size)
 
-    def step(self, number: int) -> dict[str, Tensor]:
-        """Does the update of a number, counted from 1."""
-        if self.distill.cosine:
-            decay(self.optimizer, self.distill.lr, number, self.distill.inference_updates)
-        device = self.loss.task_latents.device
-        losses = self.loss(self.sample().to(device))
+    def step(self, number: int, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Does the update of a number, which goes on after those of the distillation."""
+        distill = self.distill
+        if distill.cosine:
+            decay(self.optimizer, distill.lr, number - distill.updates, distill.inference_updates)
+        losses = self.loss(batch.to(self.loss.task_latents.device))
         gradient_step(self.optimizer, losses["loss_inference"])
         return {name: value.detach() for name, value in losses.items()}
 
