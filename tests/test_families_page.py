@@ -143,7 +143,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     for needed in ("robosuite", "h5py", "filelock", "safetensors"):
         pytest.importorskip(needed)
     from torchrl_bmrl import pipeline
-    from torchrl_bmrl.families import Family, _families, register_family
+    from torchrl_bmrl.families import Family, register_family
+    from torchrl_bmrl.tasks import FAMILIES
 
     lift = get_family("lift_to_height")
     heights = {"train": [(6,), (20,)], "inside": [(12,)], "outside": [(24,)]}
@@ -176,7 +177,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         for step in (pipeline.collect, pipeline.stage1, pipeline.stage2):
             step(opened)
         yield opened
-    del _families["few_lifts"]
+    del FAMILIES["few_lifts"]
 
 
 def studied(run: Any) -> dict[str, Any]:

@@ -32,6 +32,7 @@ from torchrl_bmrl.pipeline.export import export
 from torchrl_bmrl.pipeline.student import load_student
 from torchrl_bmrl.studies import families
 from torchrl_bmrl.studies.families import METHODS, FamilySettings, generalise, make_method
+from torchrl_bmrl.tasks import FAMILIES
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 STUDY = FamilySettings(episodes=2, cloning_updates=3)
@@ -42,7 +43,7 @@ HELD_OUT = ("walk_60", "walk_150")
 def family() -> Iterator[None]:
     tiny_family.register()
     yield
-    del families._families["walk"]
+    del FAMILIES["walk"]
 
 
 @pytest.fixture(scope="module")

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 from torchrl_bmrl.errors import ConfigError, UnknownNameError
 from torchrl_bmrl.tasks import (
+    FAMILIES,
     NAME,
     Task,
     get_task,
     import_module_of,
-    register_members,
     register_own_tasks,
 )
 
@@ -109,6 +110,11 @@ class Family:
             raise UnknownNameError("split of a family", split, SPLITS)
         return tuple(self.make(*parameter) for parameter in self.members[split])
 
+    @cached_property
+    def by_name(self) -> dict[str, tuple[float, ...]]:
+        """Parameter of each member by the name of its task."""
+        return {self.make(*parameter).name: parameter for parameter in self.all()}
+
     def parameter(self, task: str) -> tuple[float, ...]:
         """Parameter of a member.
 
@@ -118,10 +124,9 @@ class Family:
         Raises:
             UnknownNameError: if no member has that name.
         """
-        names = {self.make(*parameter).name: parameter for parameter in self.all()}
-        if task not in names:
-            raise UnknownNameError(f"member of family {self.name}", task, tuple(names))
-        return names[task]
+        if task not in self.by_name:
+            raise UnknownNameError(f"member of family {self.name}", task, tuple(self.by_name))
+        return self.by_name[task]
 
     def told(self, task: str) -> tuple[float, ...]:
         """Numbers that a policy is given which is told a member's parameter.
@@ -139,9 +144,6 @@ class Family:
         )
 
 
-_families: dict[str, Family] = {}
-
-
 def register_family(family: Family) -> Family:
     """Makes a family and its members known by name; a later family of the same name replaces it.
 
@@ -155,15 +157,7 @@ def register_family(family: Family) -> Family:
         >>> get_family("push_towards").parameters
         ('direction [°]',)
     """
-    names: dict[str, tuple[float, ...]] = {}
-
-    def find(name: str) -> Task | None:
-        if not names:  # made when a member is first looked up
-            names.update({family.make(*x).name: x for x in family.all()})
-        return family.make(*names[name]) if name in names else None
-
-    _families[family.name] = family
-    register_members(family.name, find)
+    FAMILIES[family.name] = family
     return family
 
 
@@ -175,7 +169,7 @@ def registered_families() -> tuple[str, ...]:
         ('push_towards', 'reach_hidden')
     """
     register_own_tasks()
-    return tuple(_families)
+    return tuple(FAMILIES)
 
 
 def get_family(name: str) -> Family:
@@ -196,7 +190,7 @@ def get_family(name: str) -> Family:
     known = registered_families()
     if rest not in known:
         raise UnknownNameError("family", rest, known)
-    return _families[rest]
+    return FAMILIES[rest]
 
 
 def tasks_of(name: str) -> tuple[Task, ...]:
@@ -215,5 +209,5 @@ def tasks_of(name: str) -> tuple[Task, ...]:
     """
     rest = import_module_of("task", name)
     if rest in registered_families():
-        return _families[rest].tasks("train")
+        return FAMILIES[rest].tasks("train")
     return (get_task(name),)

@@ -130,7 +130,8 @@ class Task:
 
 
 _registry: dict[str, Task] = {}
-_members: dict[str, Callable[[str], Task | None]] = {}
+FAMILIES: dict[str, Any] = {}
+"""Registered families by name; :mod:`torchrl_bmrl.families` imports this module."""
 
 
 def register_own_tasks() -> None:
@@ -155,19 +156,6 @@ def register_task(task: Task) -> Task:
     """
     _registry[task.name] = task
     return task
-
-
-def register_members(family: str, find: Callable[[str], Task | None]) -> None:
-    """Makes the members of a family known by their names, which begin with the family's.
-
-    Args:
-        family: name of the family.
-        find: returns the member of a name, ``None`` if there is none.
-
-    Example:
-        >>> register_members("knocks", lambda name: None)
-    """
-    _members[family] = find
 
 
 def registered_tasks() -> tuple[str, ...]:
@@ -206,12 +194,12 @@ def get_task(name: str) -> Task:
 
 def _find(name: str, known: tuple[str, ...]) -> Task:
     """Returns the task or the member of a family with a name."""
-    for family, find in _members.items():
-        if name not in known and name.startswith(family) and (task := find(name)) is not None:
-            return task
-    if name not in known:
-        raise UnknownNameError("task", name, (*known, *_members))
-    return _registry[name]
+    if name in known:
+        return _registry[name]
+    for family in FAMILIES.values():
+        if name.startswith(family.name) and name in family.by_name:
+            return family.make(*family.by_name[name])
+    raise UnknownNameError("task", name, (*known, *FAMILIES))
 
 
 def import_module_of(what: str, name: str) -> str:

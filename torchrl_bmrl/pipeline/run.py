@@ -176,7 +176,7 @@ class Run:
         """
         for name in registered_families():
             family = get_family(name)
-            if tuple(task.name for task in family.tasks("train")) == self.names:
+            if tuple(family.by_name)[: len(family.members["train"])] == self.names:
                 return family
         raise ConfigError(
             f"tasks is {', '.join(self.names)}; valid: the trained members of one family, such as "
@@ -185,7 +185,8 @@ class Run:
 
     def codes(self) -> list[tuple[float, ...]]:
         """Numbers that a policy is given which is told the task, for each task of the family."""
-        return [self.family.told(name) for name in self.names]
+        family = self.family
+        return [family.told(name) for name in self.names]
 
     def composition(self, name: str) -> Task:
         """Returns a composition of the run's tasks.
