@@ -14,6 +14,7 @@ from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
+from torchrl_bmrl.context_keys import CONTEXT, reads_context
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.modules.generator import Network, make_mlp
 from torchrl_bmrl.modules.task_latent import (
@@ -24,8 +25,6 @@ from torchrl_bmrl.modules.task_latent import (
     only_in_environments,
 )
 
-CONTEXT = "context"
-"""Key of the transitions of a context, batch ``[*B, K]``."""
 CONTEXT_KEYS = tuple(unravel_key((CONTEXT, key)) for key in (*TRANSITION_KEYS, "mask"))
 """Keys that a context encoder reads."""
 POOLINGS = ("mean", "attention")
@@ -171,19 +170,6 @@ def make_context_encoder(
         "task_latent": task_latent_dim,
     }
     return Network(network, in_keys=list(CONTEXT_KEYS), out_keys=["task_latent"], sizes=sizes)
-
-
-def reads_context(encoder: TensorDictModule) -> bool:
-    """Whether an encoder of m reads sets of transitions.
-
-    Args:
-        encoder: of m.
-
-    Example:
-        >>> reads_context(make_context_encoder(3, 2))
-        True
-    """
-    return any(isinstance(key, tuple) and key[0] == CONTEXT for key in encoder.in_keys)
 
 
 def as_context(transitions: TensorDictBase, mask: Tensor | None = None) -> TensorDict:

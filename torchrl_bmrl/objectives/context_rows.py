@@ -10,11 +10,9 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_bmrl.context_keys import MASK, transition_keys
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.generators import written
-from torchrl_bmrl.objectives.contexts import CONTEXT
-
-MASK = (CONTEXT, "mask")
 
 
 def context_keys(encoder: TensorDictModule) -> list[NestedKey]:
@@ -28,16 +26,19 @@ def context_keys(encoder: TensorDictModule) -> list[NestedKey]:
             f"task_encoder reads {list(encoder.in_keys)}; valid: an encoder of sets, such as "
             "torchrl_bmrl.modules.make_context_encoder"
         )
-    return [unravel_key(key[1:]) for key in encoder.in_keys if key != MASK]
+    return transition_keys(encoder)
 
 
-def encode_contexts(loss: Any, contexts: TensorDictBase, rows: TensorDictBase) -> Tensor:
+def encode_contexts(
+    loss: Any, contexts: TensorDictBase, rows: TensorDictBase, under: NestedKey = ()
+) -> Tensor:
     """m of contexts, ``(num_tasks, C, m)``.
 
     Args:
         loss: with a ``task_encoder``.
         contexts: of :func:`.group_rows`.
         rows: that they are made of, for the message.
+        under: a key of the data that contains the rows.
 
     Raises:
         BMRLError: with the shapes of the rows, if the encoder cannot read them.
@@ -45,7 +46,7 @@ def encode_contexts(loss: Any, contexts: TensorDictBase, rows: TensorDictBase) -
     try:
         points = loss.call("task_encoder", contexts)
     except BMRLError as error:
-        shapes = _shapes(rows, context_keys(loss.task_encoder))
+        shapes = _shapes(rows, transition_keys(loss.task_encoder), under)
         raise BMRLError(
             f"task_encoder cannot read contexts of {shapes}; valid: the sizes that it was made for "
             f"({error})"
@@ -53,5 +54,6 @@ def encode_contexts(loss: Any, contexts: TensorDictBase, rows: TensorDictBase) -
     return written(points, loss.tensor_keys.task_latent, loss.task_encoder)
 
 
-def _shapes(rows: TensorDictBase, keys: Iterable[NestedKey]) -> str:
-    return ", ".join(f"{key!r} {tuple(rows.get(key).shape)}" for key in keys)
+def _shapes(rows: TensorDictBase, keys: Iterable[NestedKey], under: NestedKey) -> str:
+    named = ((unravel_key((under, key)), rows.get(key).shape) for key in keys)
+    return ", ".join(f"{key!r} {tuple(shape)}" for key, shape in named)

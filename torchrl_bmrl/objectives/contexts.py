@@ -6,10 +6,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_bmrl.context_keys import CONTEXT
 from torchrl_bmrl.errors import BMRLError
-
-CONTEXT = "context"
-"""Key of a context's transitions; the encoder of a set reads its entries under this key."""
 
 
 def group_rows(
@@ -91,3 +89,15 @@ def assign(points: Tensor, own: Tensor, filled: Tensor | None, *, apart: bool) -
         shift = low + (drawn * (number - low)).long().clamp(max=count - 1)
         chosen = (torch.minimum(own, number - 1) + shift) % number
     return points.gather(1, chosen.unsqueeze(-1).expand(num_tasks, -1, size))
+
+
+def which_count(points: Tensor, filled: Tensor | None) -> Tensor | None:
+    """Which contexts have a row that counts, ``(num_tasks, C)``; ``None`` if all do.
+
+    Args:
+        points: embeddings of the contexts, ``(num_tasks, C, m)``.
+        filled: as of :func:`group_rows`.
+    """
+    if filled is None:
+        return None
+    return torch.arange(points.shape[1], device=points.device) < filled.unsqueeze(-1)

@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_bmrl import functional
+from torchrl_bmrl.context_keys import reads_context
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.generators import written
 from torchrl_bmrl.objectives.base import KeyedLoss
@@ -28,7 +29,6 @@ from torchrl_bmrl.objectives.student_terms import (
     embedded,
     encoded_keys,
     isometry,
-    reads_sets,
 )
 from torchrl_bmrl.objectives.teachers import check_teachers, per_task
 
@@ -210,7 +210,7 @@ class MetaDistillationLoss(KeyedLoss):
         self.context_size = check_number("context_size", context_size, 1, integer=True)
         self.metric_margin = check_number("metric_margin", metric_margin)
         self.temperature = check_number("temperature", temperature, 1e-6)
-        self.reads_sets = reads_sets(task_encoder)
+        self.reads_sets = reads_context(task_encoder)
         check_options(self, isometry_weight, (metric_weight, distance_weight, contrastive_weight))
         names = ("task_encoder", "task_classifier", "student_generator", "student_qvalue_network")
         networks = (task_encoder, task_classifier, student_generator, student_qvalue_network)

@@ -14,10 +14,11 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_bmrl import functional
+from torchrl_bmrl.context_keys import CONTEXT
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.objectives.checks import check_network, check_number
 from torchrl_bmrl.objectives.context_rows import context_keys, encode_contexts
-from torchrl_bmrl.objectives.contexts import CONTEXT, assign, group_rows
+from torchrl_bmrl.objectives.contexts import assign, group_rows, which_count
 from torchrl_bmrl.objectives.data import next_key
 from torchrl_bmrl.objectives.distillation import MetaDistillationLoss
 from torchrl_bmrl.objectives.relabel import predict, read_reward
@@ -202,9 +203,8 @@ class MBMLLoss(MetaDistillationLoss):
         relabelled, _ = self._relabelled(tensordict, rows, valid)
         both = torch.cat([contexts.get(CONTEXT), relabelled], -1)
         points = self._points(both, rows)
-        number = torch.arange(points.shape[1], device=points.device)
-        counts = None if filled is None else number < filled.unsqueeze(-1)
-        return Embedded(assign(points, own, filled, apart=True), points, counts)
+        latent = assign(points, own, filled, apart=True)
+        return Embedded(latent, points, which_count(points, filled))
 
     def _transitions(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor | None]:
         keys = context_keys(self.task_encoder)

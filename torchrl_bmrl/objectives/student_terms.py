@@ -7,15 +7,16 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
-from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn import functional as F
 
 from torchrl_bmrl import functional
+from torchrl_bmrl.context_keys import CONTEXT, transition_keys
 from torchrl_bmrl.contrast import contrastive_error, distance_error
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.objectives.contexts import CONTEXT, assign, group_rows
+from torchrl_bmrl.objectives.context_rows import encode_contexts
+from torchrl_bmrl.objectives.contexts import assign, group_rows, which_count
 from torchrl_bmrl.objectives.data import entry, next_key
 from torchrl_bmrl.objectives.task_rows import draw_others, draw_rows
 
@@ -76,11 +77,6 @@ class Embedded(NamedTuple):
     valid: Tensor | None  # which of the points count
 
 
-def reads_sets(encoder: TensorDictModule) -> bool:
-    """Whether an encoder of m reads sets of transitions, under ``"context"``."""
-    return any(isinstance(key, tuple) and key[0] == CONTEXT for key in encoder.in_keys)
-
-
 def check_options(
     loss: MetaDistillationLoss, isometry_weight: float, arranging: Sequence[float]
 ) -> None:
@@ -133,7 +129,7 @@ def encoded_keys(loss: MetaDistillationLoss) -> list[NestedKey]:
     if not loss.reads_sets:
         previous = [unravel_key((loss.tensor_keys.previous, key)) for key in keys]
         return keys + previous * (loss.context == "previous")
-    inner = [unravel_key(key[1:]) for key in keys if key[0] == CONTEXT and key[1:] != ("mask",)]
+    inner = transition_keys(loss.task_encoder)
     return [unravel_key((CONTEXT, key)) for key in inner] if loss.context == "given" else inner
 
 
@@ -179,22 +175,13 @@ def embed_sets(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> Embedd
     The sets are groups of the batch's own rows, and a row is not in its set; or groups of the rows
     under ``"context"``, which may be of another behaviour.
     """
-    given = loss.context == "given"
-    batch = tensordict.batch_size
-    valid = loss.valid_rows(tensordict, batch)
-    inner = [unravel_key(key[1:]) for key in loss.task_encoder.in_keys if key[1:] != ("mask",)]
-    rows = loss._entries(tensordict, inner, under=CONTEXT if given else ())
+    under = CONTEXT if loss.context == "given" else ()
+    valid = loss.valid_rows(tensordict, tensordict.batch_size)
+    rows = loss._entries(tensordict, transition_keys(loss.task_encoder), under=under)
     contexts, own, filled = group_rows(rows, loss.context_size, valid)
-    try:
-        points = loss._run("task_encoder", contexts, loss.tensor_keys.task_latent)
-    except BMRLError as error:  # it names the groups, and the caller knows the rows
-        under = CONTEXT if given else ()
-        shapes = [f"{unravel_key((under, key))!r} {tuple(rows.get(key).shape)}" for key in inner]
-        raise BMRLError(f"rows of {', '.join(shapes)} make no contexts: {error}") from error
-    if filled is not None:
-        number = torch.arange(points.shape[1], device=points.device)
-        valid = number < filled.unsqueeze(-1)
-    return Embedded(assign(points, own, filled, apart=not given), points, valid)
+    points = encode_contexts(loss, contexts, rows, under)
+    latent = assign(points, own, filled, apart=not under)
+    return Embedded(latent, points, which_count(points, filled))
 
 
 def arranging_errors(
