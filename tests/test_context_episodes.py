@@ -32,6 +32,28 @@ def test_one_task_has_no_other_behaviour(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def record_alone(seed: int, *, noise: float, gains: object = None, after: object = ()) -> None:
+    raise AssertionError("nothing is recorded")
+
+
+def test_an_expert_that_cannot_act_in_other_tasks_is_refused_before_anything_is_recorded(
+    tmp_path: Path,
+) -> None:
+    alone = replace(make_walk(0.0), record=record_alone)
+    with pytest.raises(ConfigError, match=r"task walk_0 has a record without like.*valid: 0, or"):
+        collect_demonstrations(
+            tmp_path,
+            [alone, make_walk(90.0)],
+            {"walk_0": 1, "walk_90": 1},
+            valid_episodes=1,
+            context_episodes=1,
+            noise=0.0,
+            seed=0,
+            workers=1,
+        )
+    assert not list(tmp_path.iterdir())
+
+
 def test_others_are_different_tasks_in_an_order_that_the_seed_decides() -> None:
     members = [make_walk(float(angle)) for angle in range(12)]
     drawn = [others_than(members, "walk_3", seed=seed) for seed in range(40)]

@@ -184,23 +184,6 @@ def test_held_out_members_have_the_run_s_options(folder: Path) -> None:
     assert run.horizon(replace(members[0][1], horizon=None)) == HORIZON
 
 
-@pytest.mark.parametrize(
-    ("settings", "says"),
-    [
-        ({"students": {"teacher": {}}}, "'teacher'; valid .*told"),
-        ({"students": {"told": {"updatez": 1}}}, "'updatez'; valid .*updates"),
-        ({"students": {"told": {"updates": -1}}}, "told.updates is -1; valid: above 0"),
-        ({"students": {"told": {"context": "given"}}}, "valid with distill.task_encoder=told"),
-    ],
-)
-def test_changes_to_a_student_that_are_not_valid_leave_no_study(
-    trained: Path, settings: dict[str, Any], says: str
-) -> None:
-    with Run(configured(trained)) as run, pytest.raises(BMRLError, match=says):
-        generalise(run, replace(STUDY, **settings))
-    assert not (trained / "families").exists()
-
-
 def test_a_run_without_contexts_of_another_behaviour_has_no_such_method(tmp_path: Path) -> None:
     settings = tiny_family.settings(tmp_path, {"context": "set", "inference_updates": 0})
     settings = replace(settings, collect=replace(settings.collect, context_episodes=0))

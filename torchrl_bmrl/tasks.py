@@ -61,7 +61,8 @@ class Task:
         make_env: ``make_env(num_envs=None, **options)`` returns a TorchRL environment with the
             named parts of the observation, batch ``[]`` or ``[num_envs]``.
         record: ``record(seed, noise=..., gains=..., after=..., **options)`` returns an
-            :class:`~torchrl_bmrl.data.Episode` of a scripted expert.
+            :class:`~torchrl_bmrl.data.Episode` of a scripted expert. With ``like=...``, tasks of
+            the same kind, their experts act instead; context episodes need it.
         files: demonstrations that were recorded elsewhere, and how to read them.
         parts: names of the observation's parts in demonstrations and environment; ``None``: all
             parts of the demonstrations.

@@ -69,6 +69,7 @@ class MetaWorldEnv(gymnasium.Env):
             )
         data = {"env_cls": type(self.metaworld_env), "rand_vec": values}
         data["partially_observable"] = True  # the goal reads as zero
+        # Meta-World's own interface takes pickled bytes: these are made here and read at once.
         self.metaworld_env.set_task(MetaWorldTask(env_name=env, data=pickle.dumps(data)))
         _check_accepted(self.metaworld_env, values)
         self._observation = np.zeros(39)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from torchrl_bmrl.data.robomimic import (
     read_kept_episode,
     write_episodes,
 )
-from torchrl_bmrl.errors import ConfigError, DataError
+from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
 from torchrl_bmrl.experts.settings import Experts, ExpertSettings, experts_of
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
 from torchrl_bmrl.tasks import Task, get_task
@@ -93,7 +94,8 @@ def collect_demonstrations(
         the file of each task.
 
     Raises:
-        ConfigError: for a task without ``record``, and for invalid ``experts``.
+        ConfigError: for a task without ``record``, or with one that takes no ``like`` if there are
+            ``context_episodes``, and for invalid ``experts``.
         UnknownNameError: for a name in ``after`` that is not a task.
         DataError: if an existing file has another number of episodes.
         StoppedError: if the run is stopped; finished episodes are saved.
@@ -125,6 +127,13 @@ def collect_demonstrations(
     files = {name: directory / f"{name}.hdf5" for name in by_name}
     if context_episodes and len(tasks) < 2:
         raise ConfigError("context_episodes with one task; valid: at least two tasks, or 0")
+    for task in tasks if context_episodes else ():
+        assert task.record is not None
+        if "like" not in inspect.signature(task.record).parameters:
+            raise ConfigError(
+                f"task {task.name} has a record without like, and context_episodes is "
+                f"{context_episodes}; valid: 0, or a record in which experts of other tasks can act"
+            )
     own = {name: episodes[name] + valid_episodes for name in by_name}
     counts = {name: number + context_episodes for name, number in own.items()}
     parts = {
@@ -189,6 +198,43 @@ def collect_demonstrations(
                 "run_dir or remove the file",
             )
     return files
+
+
+MAX_ATTEMPTS = 100
+"""Starts that are tried until an expert succeeds."""
+
+
+def record_success(
+    task: Task, expert: ExpertSettings, seed_of: Callable[[int], int], **options: Any
+) -> Episode:
+    """Records an episode in which the task's expert succeeds.
+
+    Args:
+        task: with ``record``.
+        expert: noise and gains.
+        seed_of: returns the seed of each attempt.
+        **options: further options of ``record``.
+
+    Returns:
+        the first episode that succeeds, or that does not tell success.
+
+    Raises:
+        BMRLError: if the expert fails from 100 starts.
+
+    Example:
+        >>> episode = record_success(get_task("reach"), ExpertSettings(noise=0.2), lambda i: i)
+        >>> bool(episode.extras["successes"].any())
+        True
+    """
+    assert task.record is not None
+    for attempt in range(MAX_ATTEMPTS):
+        episode = task.record(
+            seed_of(attempt), noise=expert.noise, gains=expert.gains, **options, **task.options
+        )
+        successes = episode.extras.get("successes")
+        if successes is None or successes.any():
+            return episode
+    raise BMRLError(f"the expert of {task.name} failed from {MAX_ATTEMPTS} starts")
 
 
 WANDERING = 6

@@ -24,7 +24,7 @@ from torchrl_bmrl.objectives.context_rows import context_keys, encode_contexts
 from torchrl_bmrl.objectives.contexts import assign, group_rows
 from torchrl_bmrl.objectives.data import check_within, entry, next_key
 from torchrl_bmrl.objectives.estimators import outcomes
-from torchrl_bmrl.objectives.generative import action_bounds
+from torchrl_bmrl.objectives.generative import action_bounds, register_bounds
 from torchrl_bmrl.objectives.task_rows import draw_pairs
 
 
@@ -206,9 +206,7 @@ class FOCALLoss(OfflineLoss):
         self.register_coefficients(
             entropy_weight=entropy_weight, actor_norm_weight=actor_norm_weight
         )
-        low, high = action_bounds(action_spec, bounds, self.tensor_keys.action)
-        self.register_buffer("action_low", low.to(**self._type_and_device))
-        self.register_buffer("action_high", high.to(**self._type_and_device))
+        register_bounds(self, *action_bounds(action_spec, bounds, self.tensor_keys.action))
         self.convert_critics(qvalue_network, num_qvalue_nets)
         self.finish()
 

@@ -115,8 +115,7 @@ class GenerativeLoss(OfflineLoss):
         low, high = action_bounds(action_spec, bounds, self.tensor_keys.action)
         size = (getattr(generator, "sizes", None) or {}).get(self.tensor_keys.action)
         check_bounds((low, high), generator, size)
-        self.register_buffer("action_low", low.to(**self._type_and_device))
-        self.register_buffer("action_high", high.to(**self._type_and_device))
+        register_bounds(self, low, high)
         if perturbation_network is None:
             self.perturbation_network = None
         else:
@@ -294,6 +293,18 @@ class GenerativeLoss(OfflineLoss):
             loss, metrics = self._ask(self.generator.row_loss, data, **self._options(LOSS_OPTIONS))
         loss = self.reduce(loss, tensordict)
         return loss, {name: average(value, valid) for name, value in metrics.items()}
+
+
+def register_bounds(loss: OfflineLoss, low: Tensor, high: Tensor) -> None:
+    """Registers the action's bounds as buffers ``action_low`` and ``action_high``.
+
+    Args:
+        loss: with a network, whose dtype and device the buffers get.
+        low: lower bound, ``()`` or ``(action_dim,)``.
+        high: upper bound, likewise.
+    """
+    loss.register_buffer("action_low", low.to(**loss._type_and_device))
+    loss.register_buffer("action_high", high.to(**loss._type_and_device))
 
 
 def action_bounds(

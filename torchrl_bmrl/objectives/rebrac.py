@@ -17,7 +17,7 @@ from torchrl_bmrl.generators import written
 from torchrl_bmrl.objectives.checks import check_network
 from torchrl_bmrl.objectives.common import OfflineLoss
 from torchrl_bmrl.objectives.data import check_within, next_key
-from torchrl_bmrl.objectives.generative import action_bounds
+from torchrl_bmrl.objectives.generative import action_bounds, register_bounds
 
 
 class ReBRACLoss(OfflineLoss):
@@ -117,9 +117,7 @@ class ReBRACLoss(OfflineLoss):
         self.convert_to_functional(actor_network, "actor_network", create_target_params=True)
         self.register_coefficients(actor_penalty=actor_penalty, critic_penalty=critic_penalty)
         self.register_coefficients(policy_noise=policy_noise, noise_clip=noise_clip)
-        low, high = action_bounds(action_spec, bounds, self.tensor_keys.action)
-        self.register_buffer("action_low", low.to(**self._type_and_device))
-        self.register_buffer("action_high", high.to(**self._type_and_device))
+        register_bounds(self, *action_bounds(action_spec, bounds, self.tensor_keys.action))
         self.convert_critics(qvalue_network, num_qvalue_nets)
         self.finish()
 

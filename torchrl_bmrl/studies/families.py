@@ -8,7 +8,7 @@ of another behaviour, its own first episode, the nearest trained member, or noth
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -21,9 +21,9 @@ from torch import Tensor
 from torchrl_bmrl.data.episodes import as_tensordict
 from torchrl_bmrl.data.robomimic import keep_episode, read_kept_episode
 from torchrl_bmrl.envs.transforms import transform_data
-from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
+from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
-from torchrl_bmrl.experts.collect import WANDERING, others_than
+from torchrl_bmrl.experts.collect import WANDERING, others_than, record_success
 from torchrl_bmrl.families import SPLITS
 from torchrl_bmrl.files import number, read_rows, whole, write_rows
 from torchrl_bmrl.modules import BCQPolicy, PathTaskLatent, reads_context
@@ -37,7 +37,7 @@ from torchrl_bmrl.reports import Section, write_study
 from torchrl_bmrl.reports.explorer import StoredExplorer
 from torchrl_bmrl.reports.members import Member, explore_members
 from torchrl_bmrl.run.folder import open_run
-from torchrl_bmrl.run.settings import check_settings, setting
+from torchrl_bmrl.run.settings import setting
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.studies.families_films import film_once, why_no_films
 from torchrl_bmrl.studies.families_line import LINES, POINTS, line_table, lines_of, play_line
@@ -58,8 +58,6 @@ METHODS = {
     "cloning": "behaviour cloning of one demonstration",
 }
 """Policies that are compared; the nearest member is known by the true parameter."""
-MAX_ATTEMPTS = 100
-"""Starts that are tried until the expert succeeds."""
 _COLUMNS: dict[str, Any] = {
     **dict.fromkeys(("method", "split", "member"), str),
     "episode": whole,
@@ -76,8 +74,6 @@ class FamilySettings:
     demonstrations: int = setting(1, above=0)  # episodes of a context
     methods: list[str] = setting(list(METHODS), choices=tuple(METHODS), unique=True)  # to compare
     cloning_updates: int = setting(2000, above=0)  # of behaviour cloning on the demonstration
-    # Changes to distill for the policies told the parameter, told nothing, and with one-hot codes.
-    students: dict[str, dict[str, Any]] = field(default_factory=dict)
     folder: ClassVar[str] = "families"  # of the study, below the run's
 
 
@@ -176,17 +172,7 @@ def student_job(run: Run, settings: FamilySettings, method: str) -> StudentJob:
         run: the run.
         settings: of the study.
         method: one of those with a student of their own.
-
-    Raises:
-        BMRLError: for ``students`` of another method, or with settings that are not valid.
     """
-    for name in settings.students:
-        if name not in _OTHERS:
-            raise UnknownNameError("method in families.students", name, tuple(_OTHERS))
-    own, known = settings.students.get(method, {}), vars(run.settings.distill)
-    for name in own:
-        if name not in known:
-            raise UnknownNameError(f"setting in families.students.{method}", name, tuple(known))
     changes: dict[str, Any] = {
         "task_encoder": _OTHERS[method],
         "context": "current",
@@ -199,9 +185,6 @@ def student_job(run: Run, settings: FamilySettings, method: str) -> StudentJob:
         "classification_weight": None,
     }
     distill: DistillSettings = replace(run.settings.distill, **changes)
-    distill = replace(distill, **own)
-    check_settings(distill, f"families.students.{method}.")
-    distill.check(["prototype"])
     return StudentJob(distill, f"{settings.folder}/{method}")
 
 
@@ -368,19 +351,15 @@ def context(run: Run, settings: FamilySettings, task: Task, method: str) -> Tens
 
 def _record(run: Run, task: Task, method: str, index: int, path: Path) -> None:
     """Records an episode of the member's expert that succeeds, or of another member's expert."""
-    assert task.record is not None
     expert = run.settings.collect.experts_of(task.name)[0]
+    seed_of = partial(run.seed, "families", method, task.name, index)
+    if method == "demonstration":
+        return keep_episode(path, record_success(task, expert, seed_of))
+    assert task.record is not None
     seed = run.seed("families", "like", task.name, index)
-    options = {} if method == "demonstration" else {"like": others_than(run.tasks, "", seed=seed)}
-    for attempt in range(MAX_ATTEMPTS):
-        seed = run.seed("families", method, task.name, index, attempt)
-        episode = task.record(
-            seed, noise=expert.noise, gains=expert.gains, **options, **task.options
-        )
-        successes = episode.extras.get("successes")
-        if method != "demonstration" or successes is None or successes.any():
-            return keep_episode(path, episode)
-    raise BMRLError(f"the expert of {task.name} failed from {MAX_ATTEMPTS} starts")
+    like = others_than(run.tasks, "", seed=seed)
+    given = {"noise": expert.noise, "gains": expert.gains, "like": like, **task.options}
+    keep_episode(path, task.record(seed_of(0), **given))
 
 
 def own_episode(run: Run, task: Task, index: int) -> TensorDictBase:

@@ -23,8 +23,9 @@ from torchrl_bmrl.data.episodes import as_tensordict
 from torchrl_bmrl.data.robomimic import keep_episode, read_kept_episode
 from torchrl_bmrl.envs.perturbation import PerturbAction
 from torchrl_bmrl.envs.transforms import transform_data
-from torchrl_bmrl.errors import BMRLError, ConfigError
+from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation import bootstrap_interval
+from torchrl_bmrl.experts.collect import record_success
 from torchrl_bmrl.files import read_rows, whole, write_rows
 from torchrl_bmrl.modules import DemonstrationTaskLatent, StageTaskLatent
 from torchrl_bmrl.modules.demonstration_latent import ALIGNMENTS
@@ -39,8 +40,6 @@ from torchrl_bmrl.tasks import Task
 
 METHODS = (*(f"demonstration, by {name}" for name in ALIGNMENTS), "task index", "cloning", "replay")
 PERTURBATIONS = ("none", "magnitude", "direction", "both", "both, constant")
-MAX_ATTEMPTS = 100
-"""Starts that are tried until the expert succeeds."""
 _COLUMNS: dict[str, Any] = {
     **dict.fromkeys(("method", "perturbation"), str),
     **dict.fromkeys(("demonstration", "episode", "stages", "success"), whole),
@@ -132,15 +131,10 @@ def demonstrate(run: Run, task: Task, number: int) -> TensorDictBase:
     """A demonstration that succeeds, recorded once: normalised, with ``stage`` before actions."""
 
     def record(path: Path) -> None:
-        assert task.record is not None
         experts = run.settings.collect.experts_of(task.name)
         expert = experts[number % len(experts)]
-        for attempt in range(MAX_ATTEMPTS):
-            seed = run.seed("imitate", "demonstration", number, attempt)
-            episode = task.record(seed, noise=expert.noise, gains=expert.gains, **task.options)
-            if episode.extras["successes"].any():
-                return keep_episode(path, episode)
-        raise BMRLError(f"the expert of {task.name} failed from {MAX_ATTEMPTS} starts")
+        seed_of = partial(run.seed, "imitate", "demonstration", number)
+        keep_episode(path, record_success(task, expert, seed_of))
 
     episode = run.once(
         f"{ImitateSettings.folder}/demonstration-{number}.npz", read_kept_episode, record
