@@ -178,6 +178,8 @@ def test_states_of_a_member_are_exact_and_both_steppers_agree(name):
 
 @pytest.mark.robosuite
 def test_the_speeds_of_a_composition_are_measured_from_its_own_start():
+    from torchrl_bmrl.envs.tabletop import TabletopEnv
+    from torchrl_bmrl.experts.controllers import make_expert
     from torchrl_bmrl.experts.sawyer_families import make_member
     from torchrl_bmrl.tasks import compose_tasks
 
@@ -186,6 +188,17 @@ def test_the_speeds_of_a_composition_are_measured_from_its_own_start():
     episode = task.record(0, noise=0.0, **task.options)
     assert episode.extras["stages"].max() >= 1
     assert episode.extras["successes"].any()
+    env = TabletopEnv(task.options["skills"])
+    scene = env.robosuite_env
+    env.reset(seed=0)
+    at_rest, expert = scene.start_position.copy(), make_expert(scene)
+    while scene.stage == 0:
+        env.step(expert())
+    assert np.array_equal(scene.start_position, scene.eef_position)
+    assert np.linalg.norm(scene.start_position - at_rest) > 0.05
+    assert scene.stage_time == 0
+    env.step(np.zeros(7))
+    assert scene.stage_time == pytest.approx(0.05)
 
 
 @pytest.mark.robosuite

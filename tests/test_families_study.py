@@ -27,6 +27,7 @@ from tiny_family import FAMILY, HORIZON, make_walk
 from torchrl_bmrl.data.robomimic import open_episodes
 from torchrl_bmrl.errors import BMRLError, ConfigError
 from torchrl_bmrl.evaluation import read_results
+from torchrl_bmrl.experts.collect import WANDERING
 from torchrl_bmrl.pipeline import Run, collect, evaluate, stage2, two_stage
 from torchrl_bmrl.pipeline.export import export
 from torchrl_bmrl.pipeline.student import load_student
@@ -172,6 +173,27 @@ def test_m_of_a_demonstration_is_that_of_the_student_and_of_another_behaviour_is
         torch.testing.assert_close(make_method(run, STUDY, task, method)[1], reads(given))
     twice = replace(STUDY, demonstrations=2)
     assert len(families.context(run, twice, task, "one_shot")) == 2 * HORIZON
+
+
+def test_a_first_episode_tries_several_trained_members(studied: tuple[Path, str]) -> None:
+    run = Run(configured(studied[0]))
+    student = run.student()[0]
+    latents = families.first_latents(run, student, make_walk(60.0), 0)
+    assert len(latents) == HORIZON
+    tried = {tuple(latent.tolist()) for latent in latents}
+    assert tried <= {tuple(point.tolist()) for point in student.prototypes}
+    assert len(tried) == min(WANDERING, len(student.prototypes))
+    assert not torch.equal(latents, families.first_latents(run, student, make_walk(60.0), 1))
+
+
+def test_a_student_knows_how_large_rewards_and_steps_are(trained: Path) -> None:
+    run = Run(configured(trained))
+    data = [run.transitions(name, split) for name in run.names for split in ("train", "context")]
+    reward = torch.cat([each["next", "reward"] for each in data])
+    student = run.student()[0]
+    for encoder in (student.task_encoder, student.context_encoder):
+        torch.testing.assert_close(encoder.module.reward_loc, reward.mean(0))
+        torch.testing.assert_close(encoder.module.reward_scale, reward.std(0))
 
 
 def test_held_out_members_have_the_run_s_options(folder: Path) -> None:
