@@ -31,12 +31,13 @@ from torchrl_bmrl.experts.collect import WANDERING
 from torchrl_bmrl.pipeline import Run, collect, evaluate, stage2, two_stage
 from torchrl_bmrl.pipeline.export import export
 from torchrl_bmrl.pipeline.student import load_student
-from torchrl_bmrl.studies import families
-from torchrl_bmrl.studies.families import METHODS, FamilySettings, generalise, make_method
+from torchrl_bmrl.studies import families, families_methods
+from torchrl_bmrl.studies.families import generalise
+from torchrl_bmrl.studies.families_methods import METHODS, OWN, make_method
 from torchrl_bmrl.tasks import FAMILIES
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
-STUDY = FamilySettings(episodes=2, cloning_updates=3)
+STUDY = tiny_family.study()
 HELD_OUT = ("walk_60", "walk_150")
 
 
@@ -135,7 +136,7 @@ def test_a_study_that_was_stopped_goes_on_to_the_same_files(
     (folder / "families" / "one_shot" / "walk_60.csv").unlink()
     with Run(configured(folder)) as run:
         assert generalise(run, STUDY) == said
-    assert played == 12 + 7 + 1
+    assert played == 12 + 15 + 1
     assert contents(folder, *patterns) == contents(studied[0], *patterns)
 
 
@@ -168,22 +169,26 @@ def test_m_of_a_demonstration_is_that_of_the_student_and_of_another_behaviour_is
     student = run.student()[0]
     task = make_walk(60.0)
     for method, reads in (("demonstration", student.embed_context), ("behaviour", student.infer)):
-        given = families.context(run, STUDY, task, method)
+        given = families_methods.context(run, STUDY, task, method)
         assert len(given) == HORIZON
         torch.testing.assert_close(make_method(run, STUDY, task, method)[1], reads(given))
     twice = replace(STUDY, demonstrations=2)
-    assert len(families.context(run, twice, task, "one_shot")) == 2 * HORIZON
+    own = families_methods.load_learner(run, twice, OWN)
+    assert len(families_methods.first_episodes(run, twice, task, own)) == 2 * HORIZON
 
 
 def test_a_first_episode_tries_several_trained_members(studied: tuple[Path, str]) -> None:
     run = Run(configured(studied[0]))
     student = run.student()[0]
-    latents = families.first_latents(run, student, make_walk(60.0), 0)
+    latents = families_methods.first_latents(run, student.prototypes, make_walk(60.0), 0)
     assert len(latents) == HORIZON
     tried = {tuple(latent.tolist()) for latent in latents}
     assert tried <= {tuple(point.tolist()) for point in student.prototypes}
     assert len(tried) == min(WANDERING, len(student.prototypes))
-    others = [families.first_latents(run, student, make_walk(60.0), i) for i in range(1, 6)]
+    others = [
+        families_methods.first_latents(run, student.prototypes, make_walk(60.0), i)
+        for i in range(1, 6)
+    ]
     assert not all(torch.equal(latents, other) for other in others)
 
 

@@ -174,5 +174,15 @@ def settings(folder: Path, distill: dict[str, Any] | None = None, **changes: Any
     )
 
 
+def study(**changes: Any) -> Any:
+    """Settings of the smallest study of held-out members, with every method."""
+    from torchrl_bmrl.studies.families_methods import FamilySettings
+    from torchrl_bmrl.studies.families_peers import FocalSettings, MBMLSettings
+
+    small: dict[str, Any] = {"updates": 4, "batch_size": 8, "context_size": 4}
+    peers = {"focal": FocalSettings(**small), "mbml": MBMLSettings(**small, reward_updates=2)}
+    return FamilySettings(**{"episodes": 2, "cloning_updates": 3, **peers, **changes})
+
+
 def register() -> None:
     register_family(FAMILY)
