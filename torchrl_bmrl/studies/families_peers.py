@@ -315,7 +315,8 @@ def _train_mbml(run: Run, peer: PeerJob, report: Report) -> None:
         context_size=mbml.context_size,
         triplet_weight=mbml.triplet_weight,
     ).to(device)
-    optimizers = {"student": make_adam(loss.parameters(), lr=mbml.lr)}
+    learned = [x for x in loss.parameters() if x.requires_grad]  # the reward models are frozen
+    optimizers = {"student": make_adam(learned, lr=mbml.lr)}
     buffer = make_multi_task_replay_buffer(data, batch_size=mbml.batch_size, device=device)
 
     def prepare(saved: Student) -> dict[str, Any]:
