@@ -109,6 +109,27 @@ def test_contexts_have_few_transitions_and_many_and_never_none():
     assert counts.max() == 8
 
 
+def test_marks_of_a_task_are_those_of_a_random_one_and_the_rest_is_its_own():
+    torch.manual_seed(0)
+    own, others = ([episodes(i, kind) for i in range(4)] for kind in (1, 2))
+    for i, data in enumerate((*own, *others)):
+        data["observation"][:, 1] = data["next", "observation"][:, 1] = float(i % 4)
+    sample = ContextSampler(own, others, size=6)
+    assert sample.marks.tolist() == [1]
+    seen = [set() for _ in range(4)]
+    known = torch.cat([data["observation"] for data in (*own, *others)])[:, 0]
+    for _ in range(30):
+        context = sample()["context"]
+        mark = context["observation"][..., 1]
+        assert torch.equal(mark, context["next", "observation"][..., 1])
+        assert torch.equal(mark, mark[..., :1].expand_as(mark))  # one task's in each context
+        assert torch.isin(context["observation"][..., 0], known).all()
+        for task in range(4):
+            seen[task] |= set(mark[task].flatten().tolist())
+    assert seen == [{0.0, 1.0, 2.0, 3.0}] * 4
+    assert not len(ContextSampler(own[:1], others[:1], size=2).marks)  # nothing to tell apart
+
+
 def test_a_student_infers_with_its_second_encoder_if_it_has_one():
     sizes = {"num_tasks": 3, "observation_dim": 3, "action_dim": 2, "num_cells": (8,)}
     data = transitions(5)
