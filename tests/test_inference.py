@@ -109,27 +109,6 @@ def test_contexts_have_few_transitions_and_many_and_never_none():
     assert counts.max() == 8
 
 
-def test_marks_of_a_task_are_those_of_a_random_one_and_the_rest_is_its_own():
-    torch.manual_seed(0)
-    own, others = ([episodes(i, kind) for i in range(4)] for kind in (1, 2))
-    for i, data in enumerate((*own, *others)):
-        data["observation"][:, 1] = data["next", "observation"][:, 1] = float(i % 4)
-    sample = ContextSampler(own, others, size=6)
-    assert sample.marks.tolist() == [1]
-    seen = [set() for _ in range(4)]
-    known = torch.cat([data["observation"] for data in (*own, *others)])[:, 0]
-    for _ in range(30):
-        context = sample()["context"]
-        mark = context["observation"][..., 1]
-        assert torch.equal(mark, context["next", "observation"][..., 1])
-        assert torch.equal(mark, mark[..., :1].expand_as(mark))  # one task's in each context
-        assert torch.isin(context["observation"][..., 0], known).all()
-        for task in range(4):
-            seen[task] |= set(mark[task].flatten().tolist())
-    assert seen == [{0.0, 1.0, 2.0, 3.0}] * 4
-    assert not len(ContextSampler(own[:1], others[:1], size=2).marks)  # nothing to tell apart
-
-
 def test_a_student_infers_with_its_second_encoder_if_it_has_one():
     sizes = {"num_tasks": 3, "observation_dim": 3, "action_dim": 2, "num_cells": (8,)}
     data = transitions(5)
@@ -155,3 +134,36 @@ def test_scales_are_those_of_rewards_and_steps():
         assert torch.allclose(network.step_scale, torch.tensor([0.1, 2.0, 1.0]), rtol=0.4)
         assert abs(network.reward_loc.item() - 5) < 2
         assert abs(network.reward_scale.item() - 3) < 1
+
+
+def test_what_stays_the_same_in_each_task_and_differs_between_them_is_not_read():
+    torch.manual_seed(0)
+    student = Student(
+        num_tasks=3, observation_dim=3, action_dim=2, task_encoder="set_attention", infers=True
+    )
+    tasks = [transitions(30) for _ in range(3)]
+    for i, data in enumerate(tasks):
+        data["observation"][:, 1] = data["next", "observation"][:, 1] = float(i)
+        data["observation"][:, 2] = data["next", "observation"][:, 2] = 5.0  # equal everywhere
+    student.set_scales(*tasks)
+    other, moved = tasks[0].clone(), tasks[0].clone()
+    for key in ("observation", ("next", "observation")):
+        other[key][:, 1] = 2.0
+        moved[key][:, 0] += 1.0
+    for encoder, m in (
+        (student.task_encoder, student.embed_context),
+        (student.context_encoder, student.infer),
+    ):
+        assert encoder.module.read.tolist() == [1, 0, 1]
+        assert torch.equal(m(other), m(tasks[0]))
+        assert not torch.equal(m(moved), m(tasks[0]))
+    student.set_scales(tasks[0])  # nothing to tell apart
+    assert student.task_encoder.module.read.tolist() == [1, 1, 1]
+
+
+def test_an_encoder_of_an_earlier_version_reads_everything():
+    encoder = make_context_encoder(3, 2, 4)
+    state = {name: x for name, x in encoder.state_dict().items() if not name.endswith("read")}
+    encoder.module.read.zero_()
+    encoder.load_state_dict(state)
+    assert encoder.module.read.tolist() == [1, 1, 1]

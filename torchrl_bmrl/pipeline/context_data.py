@@ -15,17 +15,11 @@ ONE_EPISODE = 0.7
 """Share of the contexts that are of one episode; the others mix the episodes of a behaviour."""
 
 
-CONSTANT = 1e-3
-"""An observed number is a task's mark if its variance in tasks is this share of that between."""
-
-
 class ContextSampler:
     """Draws, for each task, one context of its demonstrations and two of another behaviour.
 
     A context leaves out a random share of its transitions, so that an encoder learns from few and
-    from many. Numbers of the observation that stay the same in each task and differ between tasks
-    are those of a random task: an encoder could know the trained tasks by such marks, such as the
-    place of an object that nothing moves, and they say nothing of a task that is not trained.
+    from many.
 
     Args:
         own: demonstrations of each task, ``[N_i]`` each, with ``episode (N_i,)``.
@@ -49,17 +43,11 @@ class ContextSampler:
         self.data = torch.cat([data.select(*TRANSITION_KEYS) for data in (*own, *others)])
         first, second = _episodes(own, 0), _episodes(others, sum(map(len, own)))
         self.behaviours = (first, second, second)
-        self.marks, self.values = find_marks(own, others)
 
     def __call__(self) -> TensorDictBase:
         """Returns contexts, ``[num_tasks, 3]``."""
         rows = torch.stack([self._rows(*behaviour) for behaviour in self.behaviours], 1)
         contexts = self.data[rows]
-        if len(self.marks):
-            drawn = torch.randint(len(self.values), rows.shape[:2])
-            values = self.values[drawn].unsqueeze(2)
-            for key in ("observation", ("next", "observation")):
-                contexts[key][..., self.marks] = values
         share = torch.rand(*rows.shape[:2], 1)
         mask = torch.rand(rows.shape) < share
         mask[..., 0] = True
@@ -73,28 +61,6 @@ class ContextSampler:
         episode = torch.where(one, episode[:, :1], episode)
         step = torch.rand(shape, dtype=torch.float64) * length.gather(1, episode)
         return start.gather(1, episode) + step.long()
-
-
-def find_marks(
-    own: Sequence[TensorDictBase], others: Sequence[TensorDictBase]
-) -> tuple[Tensor, Tensor]:
-    """Positions of the observed numbers that tell the tasks apart without any behaviour.
-
-    Args:
-        own: demonstrations of each task, ``[N_i]`` each.
-        others: episodes of another behaviour, likewise.
-
-    Returns:
-        the positions, ``(k,)``, and their means in each task, ``(num_tasks, k)``.
-    """
-    pairs = zip(own, others, strict=True)
-    seen = [torch.cat([one["observation"], other["observation"]]).double() for one, other in pairs]
-    centre = torch.stack([each.mean(0) for each in seen])
-    within = torch.stack([each.var(0, correction=0) for each in seen]).mean(0)
-    between = centre.var(0, correction=0)
-    # Rounding alone is no mark.
-    (marks,) = torch.where((within < CONSTANT * between) & (between > 1e-6))
-    return marks, centre[:, marks].to(own[0]["observation"].dtype)
 
 
 def _episodes(datasets: Sequence[TensorDictBase], offset: int) -> tuple[Tensor, Tensor, Tensor]:
