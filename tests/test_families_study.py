@@ -223,6 +223,16 @@ def test_a_run_without_contexts_of_another_behaviour_has_no_such_method(tmp_path
             assert set(masks(run.demonstrations(name))) == {"train", "valid"}
 
 
+def test_members_without_pictures_are_points_alone_and_are_not_played(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(families, "why_no_films", lambda: "")
+    with Run(configured(folder)) as run:
+        found = families.explore(run, STUDY, families.held_out_members(run))
+    assert "the environments of these tasks make no pictures." in found.caption
+    assert not (folder / "families" / "films").exists()
+
+
 def test_tasks_of_no_family_are_refused(tmp_path: Path) -> None:
     settings = replace(tiny_family.settings(tmp_path), tasks=["walk_0", "walk_40"])
     with Run(settings) as run, pytest.raises(ConfigError, match="valid: the trained members of"):
@@ -267,6 +277,15 @@ def test_every_source_of_m_is_evaluated_and_the_expert_s_contexts_are_not(traine
     experts = [row for row in found if row.policy == "expert" and row.task == "walk_0"]
     assert len(experts) == 3  # two to train on and one held out
     assert all(row.success for row in experts)
+
+
+def test_without_episodes_during_stage_1_a_run_has_no_curves(trained: Path, tmp_path: Path) -> None:
+    settings = configured(tmp_path)
+    with Run(replace(settings, bcq=replace(settings.bcq, eval_episodes=0))) as run:
+        two_stage(run)
+    assert not list(tmp_path.glob("bcq/*/evaluations.csv"))
+    assert "no evaluations were found" in (tmp_path / "report.html").read_text()
+    assert contents(tmp_path, "results.csv") == contents(trained, "results.csv")
 
 
 def test_no_accuracy_is_reported_without_a_classifier(trained: Path) -> None:

@@ -134,3 +134,36 @@ def test_scales_are_those_of_rewards_and_steps():
         assert torch.allclose(network.step_scale, torch.tensor([0.1, 2.0, 1.0]), rtol=0.4)
         assert abs(network.reward_loc.item() - 5) < 2
         assert abs(network.reward_scale.item() - 3) < 1
+
+
+def test_what_stays_the_same_in_each_task_and_differs_between_them_is_not_read():
+    torch.manual_seed(0)
+    student = Student(
+        num_tasks=3, observation_dim=3, action_dim=2, task_encoder="set_attention", infers=True
+    )
+    tasks = [transitions(30) for _ in range(3)]
+    for i, data in enumerate(tasks):
+        data["observation"][:, 1] = data["next", "observation"][:, 1] = float(i)
+        data["observation"][:, 2] = data["next", "observation"][:, 2] = 5.0  # equal everywhere
+    student.set_scales(*tasks)
+    other, moved = tasks[0].clone(), tasks[0].clone()
+    for key in ("observation", ("next", "observation")):
+        other[key][:, 1] = 2.0
+        moved[key][:, 0] += 1.0
+    for encoder, m in (
+        (student.task_encoder, student.embed_context),
+        (student.context_encoder, student.infer),
+    ):
+        assert encoder.module.read.tolist() == [1, 0, 1]
+        assert torch.equal(m(other), m(tasks[0]))
+        assert not torch.equal(m(moved), m(tasks[0]))
+    student.set_scales(tasks[0])  # nothing to tell apart
+    assert student.task_encoder.module.read.tolist() == [1, 1, 1]
+
+
+def test_an_encoder_of_an_earlier_version_reads_everything():
+    encoder = make_context_encoder(3, 2, 4)
+    state = {name: x for name, x in encoder.state_dict().items() if not name.endswith("read")}
+    encoder.module.read.zero_()
+    encoder.load_state_dict(state)
+    assert encoder.module.read.tolist() == [1, 1, 1]

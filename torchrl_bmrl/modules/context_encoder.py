@@ -7,7 +7,7 @@ stored transitions, :class:`ContextTaskLatent` collects one while a policy acts.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
@@ -28,6 +28,8 @@ from torchrl_bmrl.modules.task_latent import (
 CONTEXT_KEYS = tuple(unravel_key((CONTEXT, key)) for key in (*TRANSITION_KEYS, "mask"))
 """Keys that a context encoder reads."""
 POOLINGS = ("mean", "attention")
+CONSTANT = 1e-3
+"""A number whose variance within tasks is a smaller share of that between tasks is not read."""
 
 
 class ContextNetwork(nn.Module):
@@ -54,8 +56,10 @@ class ContextNetwork(nn.Module):
             step is much smaller than the spread of the observations that a network is made for.
         reward_loc: μ, ``(1,)``.
         reward_scale: ρ, ``(1,)``.
+        read: which numbers of the observation are read, 1, or not, 0, ``(obs_dim,)``.
     """
 
+    read: Tensor
     step_scale: Tensor
     reward_loc: Tensor
     reward_scale: Tensor
@@ -70,6 +74,7 @@ class ContextNetwork(nn.Module):
         num_cells: Sequence[int],
     ) -> None:
         super().__init__()
+        self.register_buffer("read", torch.ones(observation_dim))
         self.register_buffer("step_scale", torch.ones(observation_dim))
         self.register_buffer("reward_loc", torch.zeros(1))
         self.register_buffer("reward_scale", torch.ones(1))
@@ -84,15 +89,29 @@ class ContextNetwork(nn.Module):
         """φ and, with attention, ψ of each transition, ``(*B, K, n)``."""
         step = (following - observation) / self.step_scale
         reward = (reward - self.reward_loc) / self.reward_scale
-        return self.each(torch.cat([observation, action, reward, step], -1))
+        return self.each(torch.cat([observation * self.read, action, reward, step], -1))
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        # Checkpoints of earlier versions have encoders that read everything.
+        state_dict.setdefault(f"{prefix}read", torch.ones_like(self.read))
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     @torch.no_grad()
     def set_scales(self, *datasets: TensorDictBase) -> None:
         """Sets the buffers, so that rewards and steps are as large as the rest of the input.
 
+        Numbers of the observation that stay the same in each data set and differ between them, such
+        as the place of an object that nothing moves, are not read. An encoder could know each
+        trained task by them, and then would not learn to read what tells a new task.
+
         Args:
             *datasets: transitions of all tasks and behaviours, ``[N_i]`` each.
         """
+        seen = [data["observation"].double() for data in datasets]
+        within = torch.stack([each.var(0, correction=0) for each in seen]).mean(0)
+        between = torch.stack([each.mean(0) for each in seen]).var(0, correction=0)
+        # Rounding alone tells nothing apart.
+        self.read.copy_((within >= CONSTANT * between) | (between < 1e-6))
         steps = torch.cat([x["next", "observation"] - x["observation"] for x in datasets])
         reward = torch.cat([x["next", "reward"] for x in datasets])
         several = int(len(steps) > 1)  # one transition has no deviation

@@ -76,7 +76,7 @@ class BCQSettings:
 
     epochs: int = setting(5, above=0)  # the agents are evaluated after each
     updates_per_epoch: int = setting(1000, above=0)  # updates of each network
-    eval_episodes: int = setting(3, above=0)  # episodes after each epoch, for the curves
+    eval_episodes: int = setting(3, at_least=0)  # after each epoch, for the curves; 0: no curves
     batch_size: int = setting(128, above=0)  # transitions per update
     lr: float = setting(1e-3, above=0)  # learning rate of Adam
     cosine: bool = False  # the learning rate decays to zero
