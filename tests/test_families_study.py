@@ -24,10 +24,11 @@ import tiny_family
 from small_runs import contents
 from tiny_family import FAMILY, HORIZON, make_walk
 
-from torchrl_bmrl.data.robomimic import open_episodes
+from torchrl_bmrl.data.robomimic import open_episodes, read_kept_episode
 from torchrl_bmrl.errors import BMRLError, ConfigError
 from torchrl_bmrl.evaluation import read_results
 from torchrl_bmrl.experts.collect import WANDERING
+from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.pipeline import Run, collect, evaluate, stage2, two_stage
 from torchrl_bmrl.pipeline.export import export
 from torchrl_bmrl.pipeline.student import load_student
@@ -101,6 +102,37 @@ def test_a_demonstration_of_a_held_out_member_is_cloned(studied: tuple[Path, str
     for row in found:
         assert row["success"] in ("0", "1")
         assert abs(float(row["return"])) < HORIZON
+
+
+def test_a_row_has_the_return_of_the_demonstration_that_the_policy_is_given(
+    studied: tuple[Path, str],
+) -> None:
+    for row in rows(studied[0] / "families" / "results.csv"):
+        path = studied[0] / "families" / "contexts" / f"{row['member']}-demonstration-0.npz"
+        given = read_kept_episode(path)
+        assert float(row["data_return"]) == pytest.approx(given.rewards.sum(), rel=1e-6)
+        assert row["family"] == "walk"
+    run = Run(configured(studied[0]))
+    assert (
+        families.data_return(
+            run, STUDY, replace(make_walk(60.0), record=None, files=("walk.hdf5",))
+        )
+        == ""
+    )
+
+
+def test_a_study_of_an_earlier_version_gets_the_new_columns_without_playing(
+    folder: Path, studied: tuple[Path, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.rmtree(folder)
+    shutil.copytree(studied[0], folder)
+    path = folder / "families" / "results.csv"
+    now, kept = path.read_text(), ("method", "split", "member", "episode", "return", "success")
+    write_rows(path, [{key: row[key] for key in kept} for row in rows(path)])
+    monkeypatch.setattr(families, "_play", pytest.fail)
+    with Run(configured(folder)) as run:
+        generalise(run, STUDY)
+    assert path.read_text() == now
 
 
 def test_the_line_between_members_is_measured(studied: tuple[Path, str]) -> None:
@@ -237,19 +269,6 @@ def test_a_policy_that_reads_no_transitions_cannot_be_given_any(
         with pytest.raises(BMRLError, match=r"reads .'task'.*valid: single transitions"):
             generalise(run, STUDY)
     assert not (tmp_path / "families").exists()
-
-
-def test_a_table_has_no_share_of_what_is_not_above_zero() -> None:
-    def row(method: str, value: float) -> dict[str, Any]:
-        first = {"method": method, "split": "inside", "member": "a", "episode": 0}
-        return first | {"return": value, "success": ""}
-
-    names = {"told": "told", "teacher": "agent"}
-    for told, share in ((-1.0, "–"), (0.0, "–"), (2.0, "0.500 [0.500, 0.500]")):
-        table = families.make_table("x", names, [row("told", told), row("teacher", 1.0)])
-        assert table.rows[1][3] == share
-        assert table.rows[1][4] == "–"
-    assert families.make_table("x", names, [row("teacher", 1.0)]).rows[0][3] == "–"
 
 
 # -- a run with an encoder of sets -----------------------------------------------------------------

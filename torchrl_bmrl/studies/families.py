@@ -41,7 +41,7 @@ from torchrl_bmrl.run.settings import setting
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.studies.families_films import film_once, why_no_films
 from torchrl_bmrl.studies.families_line import LINES, POINTS, line_table, lines_of, play_line
-from torchrl_bmrl.studies.families_report import make_table
+from torchrl_bmrl.studies.families_report import make_tables
 from torchrl_bmrl.studies.imitation import clone_behaviour
 from torchrl_bmrl.tasks import Task
 
@@ -123,15 +123,21 @@ def generalise(run: Run, settings: FamilySettings) -> str:
     results = run.jobs(play_member, jobs, total=steps, description="playing", unit="step")
     rows = [row for part in results for row in part]
     write_rows(run.folder / settings.folder / "results.csv", rows)
-    table = make_table(family.title, {name: METHODS[name] for name in methods}, rows)
+    tables = make_tables(family.title, {name: METHODS[name] for name in methods}, rows)
     explorer = explore(run, settings, members) if "demonstration" in methods else None
-    section = Section(heading="Tasks that nobody trained on", tables=[table], explorer=explorer)
-    write_study(run.folder, "families", section, {})
+    for end, table in tables.items():
+        section = Section(
+            heading="Tasks that nobody trained on",
+            tables=[table],
+            explorer=None if end else explorer,
+        )
+        write_study(run.folder, f"families{end}", section, {})
+    said = "\n".join(table.markdown() for table in tables.values())
     if family.measure is None or "one_hot" not in methods:
-        return table.markdown()
+        return said
     lines = [(settings, code, pair) for code in LINES for pair in lines_of(run)]
     if not lines:  # too few members
-        return table.markdown()
+        return said
     steps = sum(run.horizon(run.task(start)) for _, _, (start, _) in lines)
     results = run.jobs(
         play_line,
@@ -149,7 +155,7 @@ def generalise(run: Run, settings: FamilySettings) -> str:
         Section(heading="Between trained members", tables=[second]),
         {},
     )
-    return f"{table.markdown()}\n{second.markdown()}"
+    return f"{said}\n{second.markdown()}"
 
 
 def held_out_members(run: Run) -> list[tuple[str, Task]]:
@@ -243,7 +249,23 @@ def play_member(job: tuple[Run, Job], report: Report) -> list[dict[str, Any]]:
             partial(_play, run, settings, split, task, method, report),
             skipped=partial(report, steps),
         )
-    return rows
+    # Not in the files of the methods, so that studies of earlier versions get these columns, too.
+    more = {"family": run.family.name, "data_return": data_return(run, settings, task)}
+    return [row | more for row in rows]
+
+
+def data_return(run: Run, settings: FamilySettings, task: Task) -> float | str:
+    """Mean return of the demonstrations that a policy is given; "" for a task without an expert.
+
+    Args:
+        run: the run.
+        settings: of the study.
+        task: the member.
+    """
+    if task.record is None:
+        return ""
+    given = context(run, settings, task, "demonstration")
+    return float(given["next", "reward"].double().sum()) / settings.demonstrations
 
 
 def _play(
