@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,11 @@ from small_runs import contents
 from tiny_family import HORIZON, make_walk
 
 from torchrl_bmrl.errors import BMRLError, CheckpointError, ConfigError
-from torchrl_bmrl.experts.collect import WANDERING
+from torchrl_bmrl.modules import embed_context
 from torchrl_bmrl.pipeline import Run, collect, stage1, stage2
 from torchrl_bmrl.studies import families_methods
 from torchrl_bmrl.studies.families import generalise
-from torchrl_bmrl.studies.families_methods import context, load_learner, make_method
+from torchrl_bmrl.studies.families_methods import TRIED, context, load_learner, make_method
 from torchrl_bmrl.studies.families_peers import (
     PEERS,
     MBMLSettings,
@@ -148,7 +149,7 @@ def test_a_peer_s_m_of_a_trained_member_is_that_of_its_demonstrations(trained: P
     for name in PEERS:
         learner = load_learner(run, STUDY, name)
         for i, member in enumerate(run.names):
-            expected = learner.embed(run.transitions(member, "train"))
+            expected = embed_context(learner.encoder, run.transitions(member, "train"))
             torch.testing.assert_close(learner.prototypes[i], expected)
 
 
@@ -158,9 +159,10 @@ def test_a_peer_is_given_a_demonstration_or_its_own_first_episode(
 ) -> None:
     run = Run(tiny_family.settings(shutil.copytree(trained, tmp_path / "run")))
     task, learner = make_walk(60.0), load_learner(run, STUDY, name)
-    given = context(run, STUDY, task, "demonstration")
-    policy, latent = make_method(run, STUDY, task, name)
-    torch.testing.assert_close(latent, learner.embed(given))
+    given = [context(run, STUDY, task, "demonstration", i) for i in range(STUDY.episodes)]
+    policy, source = make_method(run, STUDY, task, name)
+    expected = torch.stack([embed_context(learner.encoder, each) for each in given])
+    torch.testing.assert_close(source.task_latent, expected)
     assert set(policy.in_keys) == {"observation", "task_latent"}
     played, original = [], families_methods.rollout_episodes
 
@@ -169,12 +171,15 @@ def test_a_peer_is_given_a_demonstration_or_its_own_first_episode(
         return played[-1]
 
     monkeypatch.setattr(families_methods, "rollout_episodes", rollout)
-    _, latent = make_method(run, STUDY, task, f"{name}_one_shot")
-    (episode,) = played
-    tried = {tuple(m.tolist()) for m in episode["task_latent"].reshape(HORIZON, -1)}
-    assert tried <= {tuple(point.tolist()) for point in learner.prototypes}
-    assert len(tried) == min(WANDERING, len(run.names))
-    torch.testing.assert_close(latent, learner.embed(episode.reshape(-1)))
+    _, source = make_method(run, STUDY, task, f"{name}_one_shot")
+    (episodes,) = played
+    for episode in episodes:
+        tried = {tuple(m.tolist()) for m in episode["task_latent"]}
+        assert tried <= {tuple(point.tolist()) for point in learner.prototypes}
+        assert len(tried) == min(TRIED, len(run.names))
+    with closing(run.make_env(task, source, num_envs=STUDY.episodes)) as env:
+        start = env.reset()["task_latent"]
+    torch.testing.assert_close(start, embed_context(learner.encoder, episodes))
 
 
 def test_focal_acts_without_noise(trained: Path) -> None:

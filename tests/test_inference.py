@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.modules import as_context, make_context_encoder, make_task_encoder
@@ -98,6 +99,44 @@ def test_a_context_is_of_one_task_and_one_behaviour():
             assert torch.equal(behaviour[1:], torch.full((2, 6), 2.0))
         single.append((reward == reward[..., :1]).all(-1).float().mean())
     assert 0.5 < torch.stack(single).mean() < 0.9  # most contexts are of one episode
+
+
+class Rewards(torch.nn.Module):
+    """The reward of task i is 1000 i plus what the motion says."""
+
+    def forward(self, observation, action):
+        task = torch.arange(len(action)).reshape(-1, 1, 1)
+        return (1000.0 * task + action[..., :1]).expand(*action.shape[:2], 2)
+
+
+def test_contexts_of_other_behaviour_are_often_other_tasks_with_the_own_task_s_rewards():
+    torch.manual_seed(0)
+    own, others = ([episodes(i, kind) for i in range(4)] for kind in (1, 2))
+    models = TensorDictModule(Rewards(), ["observation", "action"], ["reward_prediction"])
+    sample = ContextSampler(own, others, size=6, reward_models=models)
+    lent, lenders = [], set()
+    for _ in range(60):
+        context = sample()["context"]
+        reward = context["next", "reward"].squeeze(-1)
+        action = context["action"][..., 0]
+        for task in range(4):
+            recorded = others[task]["action"][:, 0]
+            assert torch.equal(reward[task, 0] // 10, torch.full((6,), 10.0 * task + 1))
+            for k in (1, 2):
+                relabelled = torch.isclose(reward[task, k], 1000 * task + action[task, k]).all()
+                kept = (reward[task, k] // 10 == 10 * task + 2).all()
+                assert relabelled != kept
+                lent.append(float(relabelled))
+                if kept:
+                    assert torch.isin(action[task, k], recorded).all()
+                else:
+                    lenders |= {
+                        (task, i)
+                        for i in range(4)
+                        if torch.isin(action[task, k], others[i]["action"][:, 0]).all()
+                    }
+    assert 0.6 < sum(lent) / len(lent) < 0.8
+    assert len(lenders) == 16  # each task lends to each
 
 
 def test_contexts_have_few_transitions_and_many_and_never_none():

@@ -142,6 +142,7 @@ def settings(folder: Path, distill: dict[str, Any] | None = None, **changes: Any
     small = {
         "updates": 4,
         "inference_updates": 2,
+        "reward_updates": 3,
         "batch_size": 8,
         "num_cells": [16],
         "task_encoder": "set_attention",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torchrl_bmrl.evaluation.clusters import clustered_ratio
 from torchrl_bmrl.evaluation.paired import paired_difference
 from torchrl_bmrl.evaluation.results import (
     POLICIES,
@@ -27,6 +28,7 @@ __all__ = [
     "ResultRow",
     "Summary",
     "bootstrap_interval",
+    "clustered_ratio",
     "paired_difference",
     "probability_of_improvement",
     "rank_correlation",

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torchrl_bmrl.context_keys import CONTEXT, reads_context
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.modules.generator import Network, make_mlp
+from torchrl_bmrl.modules.scales import set_scales
 from torchrl_bmrl.modules.task_latent import (
     TRANSITION_KEYS,
     PrototypeTaskLatent,
@@ -110,17 +111,8 @@ class ContextNetwork(nn.Module):
         seen = [data["observation"].double() for data in datasets]
         within = torch.stack([each.var(0, correction=0) for each in seen]).mean(0)
         between = torch.stack([each.mean(0) for each in seen]).var(0, correction=0)
-        # Rounding alone tells nothing apart.
-        self.read.copy_((within >= CONSTANT * between) | (between < 1e-6))
-        steps = torch.cat([x["next", "observation"] - x["observation"] for x in datasets])
-        reward = torch.cat([x["next", "reward"] for x in datasets])
-        several = int(len(steps) > 1)  # one transition has no deviation
-        # A number that hardly moves carries rounding errors, which must not be enlarged.
-        deviation = steps.double().std(0, correction=several)
-        self.step_scale.copy_(torch.where(deviation > 1e-3, deviation, 1.0))
-        self.reward_loc.copy_(reward.double().mean(0))
-        deviation = reward.double().std(0, correction=several)
-        self.reward_scale.copy_(torch.where(deviation > 0, deviation, 1.0))
+        self.read.copy_((within >= CONSTANT * between) | (between < 1e-6))  # rounding tells nothing
+        set_scales(self, *datasets)
 
     def combine(self, features: Tensor, mask: Tensor) -> Tensor:
         """m of the transitions that count, ``(*B, m)``.
@@ -276,6 +268,7 @@ class ContextTaskLatent(PrototypeTaskLatent):
         encoder: :func:`make_context_encoder`'s module, trained.
         context: transitions that the context starts with in each episode, batch ``[K]``, or
             ``[*B, K]`` for the environments of a batch; ``None`` for none.
+        mask: which of these count, boolean, ``(*B, K)``; ``None`` if all do.
 
     Raises:
         BMRLError: for an encoder of single transitions, or a context that :func:`as_context`
@@ -292,20 +285,28 @@ class ContextTaskLatent(PrototypeTaskLatent):
     """
 
     given: Tensor | None
+    counts: Tensor | None
 
     def __init__(
         self,
         task_latent: Tensor,
         encoder: TensorDictModule,
         context: TensorDictBase | None = None,
+        mask: Tensor | None = None,
     ) -> None:
         super().__init__(task_latent)
         if not reads_context(encoder):
             raise BMRLError("the encoder reads single transitions; valid: make_context_encoder")
         self.encoder = encoder
         self.network = cast(ContextNetwork, encoder.module)
-        given = None if context is None else self._features(as_context(context))
+        given = counts = None
+        if context is not None:
+            whole = as_context(context, mask)
+            counts = whole[CONTEXT, "mask"]
+            # What does not count may hold anything, also no numbers.
+            given = self._features(whole).masked_fill(~counts.unsqueeze(-1), 0)
         self.register_buffer("given", given)
+        self.register_buffer("counts", counts)
         self._kept: Tensor | None = None
         self._valid: Tensor | None = None
 
@@ -325,13 +326,13 @@ class ContextTaskLatent(PrototypeTaskLatent):
             number = torch.arange(self._valid.shape[-1], device=self._valid.device)
             valid = self._valid & ~(reset.reshape(*shape, 1) & (number >= given))
             # What counts nowhere any more would stay in memory for ever.
-            used = valid.reshape(-1, valid.shape[-1]).any(0)
+            used = valid.reshape(-1, valid.shape[-1]).any(0) | (number < given)
             self._kept, self._valid = self._kept[..., used, :], valid[..., used]
         return self._write(tensordict_reset)
 
     def _begin(self, shape: torch.Size) -> None:
         """All environments begin anew."""
-        if self.given is None:
+        if self.given is None or self.counts is None:
             self._kept = self._valid = None
             return
         batch = self.given.shape[:-2]
@@ -341,7 +342,7 @@ class ContextTaskLatent(PrototypeTaskLatent):
                 "one context, or one for each"
             )
         self._kept = self.given.expand(*shape, *self.given.shape[-2:])
-        self._valid = self._kept.new_ones(self._kept.shape[:-1], dtype=torch.bool)
+        self._valid = self.counts.expand(*shape, self.counts.shape[-1])
 
     def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
         shape = tensordict.batch_size

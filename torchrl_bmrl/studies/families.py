@@ -16,7 +16,7 @@ from typing import Any
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.families import SPLITS
 from torchrl_bmrl.files import number, read_rows, whole, write_rows
-from torchrl_bmrl.modules import PathTaskLatent, reads_context
+from torchrl_bmrl.modules import embed_context, reads_context
 from torchrl_bmrl.modules.task_latent import check_reads_transitions
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.settings import DistillSettings
@@ -29,9 +29,16 @@ from torchrl_bmrl.run.folder import open_run
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.studies.families_films import film_once, why_no_films
 from torchrl_bmrl.studies.families_line import LINES, POINTS, line_table, lines_of, play_line
-from torchrl_bmrl.studies.families_methods import METHODS, FamilySettings, make_method
+from torchrl_bmrl.studies.families_methods import (
+    METHODS,
+    OWN,
+    FamilySettings,
+    context,
+    load_learner,
+    make_method,
+)
 from torchrl_bmrl.studies.families_peers import PEERS, PeerJob, train_peer
-from torchrl_bmrl.studies.families_report import make_table
+from torchrl_bmrl.studies.families_report import make_tables
 from torchrl_bmrl.tasks import Task
 
 HELD_OUT = SPLITS[1:]
@@ -102,15 +109,21 @@ def generalise(run: Run, settings: FamilySettings) -> str:
     results = run.jobs(play_member, jobs, total=steps, description="playing", unit="step")
     rows = [row for part in results for row in part]
     write_rows(run.folder / settings.folder / "results.csv", rows)
-    table = make_table(family.title, {name: METHODS[name] for name in methods}, rows)
+    tables = make_tables(family.title, {name: METHODS[name] for name in methods}, rows)
     explorer = explore(run, settings, members) if "demonstration" in methods else None
-    section = Section(heading="Tasks that nobody trained on", tables=[table], explorer=explorer)
-    write_study(run.folder, "families", section, {})
+    for end, table in tables.items():
+        section = Section(
+            heading="Tasks that nobody trained on",
+            tables=[table],
+            explorer=None if end else explorer,
+        )
+        write_study(run.folder, f"families{end}", section, {})
+    said = "\n".join(table.markdown() for table in tables.values())
     if family.measure is None or "one_hot" not in methods:
-        return table.markdown()
+        return said
     lines = [(settings, code, pair) for code in LINES for pair in lines_of(run)]
     if not lines:  # too few members
-        return table.markdown()
+        return said
     steps = sum(run.horizon(run.task(start)) for _, _, (start, _) in lines)
     results = run.jobs(
         play_line,
@@ -128,7 +141,7 @@ def generalise(run: Run, settings: FamilySettings) -> str:
         Section(heading="Between trained members", tables=[second]),
         {},
     )
-    return f"{table.markdown()}\n{second.markdown()}"
+    return f"{said}\n{second.markdown()}"
 
 
 def held_out_members(run: Run) -> list[tuple[str, Task]]:
@@ -157,6 +170,7 @@ def student_job(run: Run, settings: FamilySettings, method: str) -> StudentJob:
         "context": "current",
         "context_size": 1,
         "inference_updates": 0,
+        "reward_updates": 0,
         "isometry_weight": 0.0,
         "metric_weight": 0.0,
         "distance_weight": 0.0,
@@ -196,7 +210,9 @@ def look_at_member(
 ) -> Member:
     """m of a member's demonstration and, if wanted, an episode that is played with it."""
     run, (settings, split, task, filmed) = job
-    policy, latent = make_method(run, settings, task, "demonstration")
+    learner = load_learner(run, settings, OWN)
+    latent = embed_context(learner.encoder, context(run, settings, task, "demonstration", 0))
+    policy = learner.policy
     return Member(
         title=task.title,
         split=split,
@@ -222,7 +238,25 @@ def play_member(job: tuple[Run, Job], report: Report) -> list[dict[str, Any]]:
             partial(_play, run, settings, split, task, method, report),
             skipped=partial(report, steps),
         )
-    return rows
+    # Not in the files of the methods, so that studies of earlier versions get these columns, too.
+    returns = [data_return(run, settings, task, i) for i in range(settings.episodes)]
+    family = run.family.name
+    return [row | {"family": family, "data_return": returns[row["episode"]]} for row in rows]
+
+
+def data_return(run: Run, settings: FamilySettings, task: Task, index: int) -> float | str:
+    """Mean return of the demonstrations that a policy is given; "" for a task without an expert.
+
+    Args:
+        run: the run.
+        settings: of the study.
+        task: the member.
+        index: number of the episode.
+    """
+    if task.record is None:
+        return ""
+    given = context(run, settings, task, "demonstration", index)
+    return float(given["next", "reward"].double().sum()) / settings.demonstrations
 
 
 def _play(
@@ -235,9 +269,8 @@ def _play(
     path: Path,
 ) -> None:
     seeds = [run.seed("families", task.name, i) for i in range(settings.episodes)]
-    policy, latent = make_method(run, settings, task, method)
-    points = latent if latent.ndim > 1 else latent.unsqueeze(0)
-    outcomes = run.play(task, policy, PathTaskLatent(points), seeds=seeds, report=report)
+    policy, source = make_method(run, settings, task, method)
+    outcomes = run.play(task, policy, source, seeds=seeds, report=report)
     first = {"method": method, "split": split, "member": task.name}
     rows = [
         {

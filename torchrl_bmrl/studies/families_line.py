@@ -35,7 +35,7 @@ POINTS = 9
 STEPS_APART = 3
 """Trained members from one end of a line to the other, in the order of the family."""
 MOST_LINES = 6
-_COLUMNS: dict[str, Any] = {
+COLUMNS: dict[str, Any] = {
     **dict.fromkeys(("code", "start", "end"), str),
     **dict.fromkeys(("share", "measured"), number),
     "episode": whole,
@@ -96,7 +96,7 @@ def play_line(
 
     return run.once(
         f"{settings.folder}/lines/{code}-{start}-{end}.csv",
-        partial(read_rows, columns=_COLUMNS),
+        partial(read_rows, columns=COLUMNS),
         play,
         skipped=lambda: report(POINTS * settings.episodes * run.horizon(run.task(start))),
     )

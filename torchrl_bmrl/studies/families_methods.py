@@ -11,15 +11,22 @@ from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs.transforms import Transform
 
 from torchrl_bmrl.data.episodes import as_tensordict
 from torchrl_bmrl.data.robomimic import keep_episode, read_kept_episode
 from torchrl_bmrl.envs.transforms import transform_data
-from torchrl_bmrl.evaluation.rollout import rollout_episodes
-from torchrl_bmrl.experts.collect import WANDERING, others_than, record_success
-from torchrl_bmrl.modules import BCQPolicy, PathTaskLatent
+from torchrl_bmrl.evaluation.rollout import rollout_episodes, still_playing
+from torchrl_bmrl.experts.collect import others_than, record_success
+from torchrl_bmrl.modules import (
+    BCQPolicy,
+    ContextTaskLatent,
+    PathTaskLatent,
+    PrototypeTaskLatent,
+    embed_context,
+)
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.student import load_student
 from torchrl_bmrl.run.settings import setting
@@ -43,6 +50,8 @@ METHODS = {
     "mbml_one_shot": "MBML, given its own first episode",
 }
 """Policies that are compared; the nearest member is known by the true parameter."""
+TRIED = 10
+"""Trained members whose m a first episode tries."""
 OWN = "student"
 """The policy that the run distilled, among the learners."""
 _WAYS = {
@@ -66,7 +75,7 @@ class FamilySettings:
     """Settings of :func:`torchrl_bmrl.studies.families.generalise`."""
 
     episodes: int = setting(5, above=0)  # of each held-out member with each method
-    demonstrations: int = setting(1, above=0)  # episodes of a context
+    demonstrations: int = setting(1, above=0)  # episodes that a policy is given in each of them
     methods: list[str] = setting(list(METHODS), choices=tuple(METHODS), unique=True)  # to compare
     cloning_updates: int = setting(2000, above=0)  # of behaviour cloning on the demonstration
     focal: FocalSettings = field(default_factory=FocalSettings)  # training of FOCAL
@@ -86,14 +95,14 @@ class Learner:
     Attributes:
         policy: reads ``task_latent``, writes ``action``.
         prototypes: m of each trained member, ``(num_tasks, m)``.
-        embed: m of transitions ``[K]`` of a demonstration.
-        infer: m of transitions ``[K]`` of any behaviour.
+        encoder: m of a demonstration.
+        infers: m of any behaviour.
     """
 
     policy: TensorDictModuleBase
     prototypes: Tensor
-    embed: Callable[[TensorDictBase], Tensor]
-    infer: Callable[[TensorDictBase], Tensor]
+    encoder: TensorDictModule
+    infers: TensorDictModule
 
 
 def load_learner(run: Run, settings: FamilySettings, name: str) -> Learner:
@@ -110,18 +119,19 @@ def load_learner(run: Run, settings: FamilySettings, name: str) -> Learner:
     path = run.folder / settings.folder / name / "checkpoint.safetensors"
     if name == "focal":
         focal = load_focal(path)
-        return Learner(focal.policy(), focal.prototypes, focal.embed_context, focal.embed_context)
+        return Learner(focal.policy(), focal.prototypes, focal.encoder, focal.encoder)
     student, metadata = run.student() if name == OWN else load_student(path)
     policy = student.policy(
         num_candidates=run.settings.evaluate.num_candidates, latent_clip=metadata["latent_clip"]
     )
-    return Learner(policy, student.prototypes, student.embed_context, student.infer)
+    encoder = student.task_encoder
+    return Learner(policy, student.prototypes, encoder, student.context_encoder or encoder)
 
 
 def make_method(
     run: Run, settings: FamilySettings, task: Task, method: str
-) -> tuple[TensorDictModuleBase, Tensor]:
-    """The policy of a method on a member, and its m: ``(m,)``, or ``(T, m)`` step by step.
+) -> tuple[TensorDictModuleBase, Transform]:
+    """The policy of a method on a member, and where it has m from in the episodes of the study.
 
     Args:
         run: the run.
@@ -130,50 +140,34 @@ def make_method(
         method: one of :data:`METHODS`.
     """
     if method == "cloning":
-        data = context(run, settings, task, "demonstration")
+        data = context(run, settings, task, "demonstration", 0)
         seed = run.seed("families", "cloning", task.name)
-        return clone_behaviour(data, updates=settings.cloning_updates, seed=seed), torch.zeros(1)
+        policy = clone_behaviour(data, updates=settings.cloning_updates, seed=seed)
+        return policy, PrototypeTaskLatent(torch.zeros(1))
     code = torch.tensor(run.family.told(task.name), dtype=torch.float32)
     codes = torch.tensor(run.codes(), dtype=torch.float32)
     nearest = int((codes - code).norm(dim=-1).argmin())
     if method == "teacher":
         count = run.settings.evaluate.num_candidates
         teacher = BCQPolicy.frozen(run.teacher(run.names[nearest]), num_candidates=count)
-        return teacher, torch.zeros(1)
+        return teacher, PrototypeTaskLatent(torch.zeros(1))
     name, given = _WAYS[method]
     learner = load_learner(run, settings, name)
-    made: dict[str, Callable[[], Tensor]] = {
-        "parameter": lambda: code,
-        "nearest": lambda: learner.prototypes[nearest],
-        "nothing": lambda: learner.prototypes[0],
-        "first": lambda: first_latents(run, learner.prototypes, task, 0),
-        "demonstration": lambda: learner.embed(context(run, settings, task, given)),
-        "behaviour": lambda: learner.infer(context(run, settings, task, given)),
-        "one_shot": lambda: learner.infer(first_episodes(run, settings, task, learner)),
-    }
-    return learner.policy, made[given]()
+    if given in ("parameter", "nearest", "nothing"):
+        points = {"parameter": code, "nearest": learner.prototypes[nearest]}
+        return learner.policy, PrototypeTaskLatent(points.get(given, learner.prototypes[0]))
+    if given == "first":
+        return learner.policy, trying(run, settings, task, learner)
+    if given == "one_shot":
+        return learner.policy, after_first_episodes(run, settings, task, learner)
+    encoder = learner.encoder if given == "demonstration" else learner.infers
+    contexts = [context(run, settings, task, given, i) for i in range(settings.episodes)]
+    latents = torch.stack([embed_context(encoder, each) for each in contexts])
+    return learner.policy, PathTaskLatent(latents.unsqueeze(1))
 
 
-def first_latents(run: Run, prototypes: Tensor, task: Task, index: int) -> Tensor:
-    """m of an episode before anything is known: of some trained members in turn, ``(T, m)``.
-
-    Args:
-        run: the run.
-        prototypes: m of each trained member, ``(num_tasks, m)``.
-        task: the member.
-        index: number of the episode.
-    """
-    generator = torch.Generator().manual_seed(run.seed("families", "sweep", task.name, index))
-    chosen = torch.randperm(len(prototypes), generator=generator)[:WANDERING]
-    horizon = run.horizon(task)
-    step = torch.arange(horizon) * len(chosen) // horizon
-    return prototypes[chosen[step]]
-
-
-def first_episodes(
-    run: Run, settings: FamilySettings, task: Task, learner: Learner
-) -> TensorDictBase:
-    """A policy's own first episodes of a member, ``[K]``: it knows nothing of the parameter.
+def trying(run: Run, settings: FamilySettings, task: Task, learner: Learner) -> PathTaskLatent:
+    """m of episodes before anything is known: of some trained members in turn.
 
     Args:
         run: the run.
@@ -181,27 +175,51 @@ def first_episodes(
         task: the member.
         learner: the policy.
     """
-    episodes = []
-    for i in range(settings.demonstrations):
-        latents = PathTaskLatent(first_latents(run, learner.prototypes, task, i))
-        seed = run.seed("families", "first", task.name, i)
-        with closing(run.make_env(task, latents, num_envs=1)) as env:
-            played = rollout_episodes(env, learner.policy, seed=[seed], max_steps=run.horizon(task))
-        episodes.append(played.reshape(-1))
-    return torch.cat(episodes)
+    paths, horizon = [], run.horizon(task)
+    for i in range(settings.episodes):
+        generator = torch.Generator().manual_seed(run.seed("families", "sweep", task.name, i))
+        chosen = torch.randperm(len(learner.prototypes), generator=generator)[:TRIED]
+        step = torch.arange(horizon) * len(chosen) // horizon
+        paths.append(learner.prototypes[chosen[step]])
+    return PathTaskLatent(torch.stack(paths))
 
 
-def context(run: Run, settings: FamilySettings, task: Task, given: str) -> TensorDictBase:
-    """Recorded transitions of a member that a policy is given, ``[K]``, normalised.
+def after_first_episodes(
+    run: Run, settings: FamilySettings, task: Task, learner: Learner
+) -> ContextTaskLatent:
+    """m of a context that starts with a policy's own first episode, and grows in the second.
+
+    Args:
+        run: the run.
+        settings: of the study.
+        task: the member.
+        learner: the policy, which in its first episode knows nothing of the member.
+
+    Raises:
+        BMRLError: for an encoder of single transitions.
+    """
+    first = trying(run, settings, task, learner)
+    seeds = [run.seed("families", "first", task.name, i) for i in range(settings.episodes)]
+    with closing(run.make_env(task, first, num_envs=len(seeds))) as env:
+        played = rollout_episodes(env, learner.policy, seed=seeds, max_steps=run.horizon(task))
+    start = learner.prototypes[0]  # of no episode: each has a context
+    return ContextTaskLatent(start, learner.infers, played, still_playing(played))
+
+
+def context(
+    run: Run, settings: FamilySettings, task: Task, given: str, index: int
+) -> TensorDictBase:
+    """Recorded transitions of a member that a policy is given in an episode, ``[K]``, normalised.
 
     Args:
         run: the run.
         settings: of the study.
         task: the member.
         given: ``"demonstration"`` or ``"behaviour"``.
+        index: number of the episode.
     """
     episodes = []
-    for i in range(settings.demonstrations):
+    for i in range(index * settings.demonstrations, (index + 1) * settings.demonstrations):
         record: Callable[[Path], None] = partial(_record, run, task, given, i)
         file = f"{settings.folder}/contexts/{task.name}-{given}-{i}.npz"
         episode = run.once(file, read_kept_episode, record)

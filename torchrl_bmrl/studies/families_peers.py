@@ -13,9 +13,8 @@ from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
-from torch.optim import Adam
 from torchrl.objectives import SoftUpdate
 
 from torchrl_bmrl.data import make_multi_task_replay_buffer
@@ -29,19 +28,19 @@ from torchrl_bmrl.modules import (
     make_qvalue_network,
     make_reward_models,
 )
-from torchrl_bmrl.objectives import FOCALLoss, MBMLLoss, RewardModelLoss
+from torchrl_bmrl.objectives import FOCALLoss, MBMLLoss
+from torchrl_bmrl.pipeline.rewards import train_reward_models
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.stage1 import sizes_of
 from torchrl_bmrl.pipeline.stage2 import value_statistics
 from torchrl_bmrl.pipeline.student import Student
+from torchrl_bmrl.pipeline.training import Training, make_update
 from torchrl_bmrl.pipeline.training_data import deviation
 from torchrl_bmrl.run.settings import setting
 from torchrl_bmrl.run.workers import Report
-from torchrl_bmrl.studies.families_training import Training
 from torchrl_bmrl.training.checkpoint import build, load_checkpoint
 from torchrl_bmrl.training.update import (
     Metrics,
-    Update,
     gradient_step,
     keep_freed_memory,
     make_adam,
@@ -129,13 +128,10 @@ class Focal(nn.Module):
         )
         self.register_buffer("prototypes", torch.zeros(num_tasks, task_latent_dim))
 
-    def embed_context(self, context: TensorDictBase) -> Tensor:
-        """Returns m of a set of transitions, ``(*B, m)``.
-
-        Args:
-            context: normalised transitions, batch ``[*B, K]``.
-        """
-        return embed_context(extract_network(self.loss, "task_encoder"), context)
+    @property
+    def encoder(self) -> TensorDictModule:
+        """The encoder of contexts, :func:`.make_context_encoder`'s module."""
+        return extract_network(self.loss, "task_encoder")
 
     def set_prototypes(self, datasets: Sequence[TensorDictBase]) -> None:
         """Computes m of each trained member.
@@ -143,7 +139,7 @@ class Focal(nn.Module):
         Args:
             datasets: its demonstrations, ``[N_i]`` each.
         """
-        self.prototypes.copy_(torch.stack([self.embed_context(data) for data in datasets]))
+        self.prototypes.copy_(torch.stack([embed_context(self.encoder, data) for data in datasets]))
 
     def policy(self) -> TensorDictModuleBase:
         """The actor without its noise."""
@@ -224,7 +220,7 @@ def _train_focal(run: Run, peer: PeerJob, report: Report) -> None:
     data = peer_data(run, focal.data)
     own = [run.transitions(name, "train") for name in run.names]
     torch.manual_seed(run.seed("families", peer.name))
-    options = {
+    options: dict[str, Any] = {
         "num_tasks": len(data),
         "num_cells": run.settings.distill.num_cells,
         **sizes_of(data[0]),
@@ -286,7 +282,16 @@ def _train_mbml(run: Run, peer: PeerJob, report: Report) -> None:
     torch.manual_seed(run.seed("families", peer.name))
     teachers = [BCQPolicy.frozen(run.teacher(name)) for name in run.names]
     models = make_reward_models(len(data), *sizes.values())
-    _train_reward_models(run, peer, models, data, report)
+    train_reward_models(
+        run,
+        f"{peer.folder}/rewards",
+        models,
+        data,
+        report,
+        updates=mbml.reward_updates,
+        batch_size=mbml.batch_size,
+        lr=mbml.lr,
+    )
 
     torch.manual_seed(run.seed("families", peer.name, "distillation"))
     options = {
@@ -331,43 +336,11 @@ def _train_mbml(run: Run, peer: PeerJob, report: Report) -> None:
         run, peer.folder, "student", student, optimizers, {"student": mbml.lr}, prepare
     )
     training.train(
-        _total(loss, optimizers["student"]),
+        make_update(loss, optimizers["student"]),
         lambda: buffer.sample().select(*loss.in_keys),
         mbml.updates,
         report,
     )
-
-
-def _train_reward_models(
-    run: Run, peer: PeerJob, models: nn.Module, data: list[TensorDictBase], report: Report
-) -> None:
-    """Trains the models in place."""
-    mbml, device = peer.settings, run.settings.device
-    assert isinstance(mbml, MBMLSettings)
-    loss = RewardModelLoss(cast(Any, models)).to(device)
-    optimizers = {"rewards": make_adam(loss.parameters(), lr=mbml.lr)}
-    buffer = make_multi_task_replay_buffer(data, batch_size=mbml.batch_size, device=device)
-    training = Training(
-        run, f"{peer.folder}/rewards", "rewards", models, optimizers, {"rewards": mbml.lr}
-    )
-    training.train(
-        _total(loss, optimizers["rewards"]),
-        lambda: buffer.sample().select(*loss.in_keys),
-        mbml.reward_updates,
-        report,
-    )
-
-
-def _total(loss: Any, optimizer: Adam) -> Update:
-    """An update on the sum of a loss's terms."""
-
-    def update(batch: TensorDictBase) -> Metrics:
-        losses = loss(batch)
-        total = sum(term for name, term in losses.items() if name.startswith("loss_"))
-        gradient_step(optimizer, total)
-        return {name: value.detach() for name, value in losses.items()}
-
-    return update
 
 
 PEERS: Mapping[str, Callable[[Run, PeerJob, Report], None]] = {

@@ -1,4 +1,4 @@
-"""The training of a published method: its checkpoints, its log and its learning rates."""
+"""A training with checkpoints, a log and learning rates that decay."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.training.checkpoint import resume_training, save_training
 from torchrl_bmrl.training.fit import Every, fit
 from torchrl_bmrl.training.health import check_metrics
-from torchrl_bmrl.training.update import Metrics, Update, accelerate, decay
+from torchrl_bmrl.training.update import Metrics, Update, accelerate, decay, gradient_step
 
 
 @dataclass
 class Training:
-    """A training that saves checkpoints and resumes, as that of a student.
+    """A training that saves checkpoints, and resumes from the last one.
 
     Attributes:
         run: the run.
@@ -116,3 +116,20 @@ class Training:
                 save=save,
                 report=report,
             )
+
+
+def make_update(loss: Any, optimizer: Adam) -> Update:
+    """An update on the sum of a loss's terms.
+
+    Args:
+        loss: returns terms whose names start with ``loss_``, and metrics.
+        optimizer: of its networks.
+    """
+
+    def update(batch: TensorDictBase) -> Metrics:
+        losses = loss(batch)
+        total = sum(term for name, term in losses.items() if name.startswith("loss_"))
+        gradient_step(optimizer, total)
+        return {name: value.detach() for name, value in losses.items()}
+
+    return update
