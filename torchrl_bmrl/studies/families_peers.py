@@ -55,10 +55,10 @@ DATA = ("all", "demonstrations")
 class FocalSettings:
     """Training of FOCAL."""
 
-    updates: int = setting(3000, above=0)
+    updates: int = setting(2500, above=0)
     tasks_per_update: int = setting(16, above=1)  # trained members in an update, at random
-    batch_size: int = setting(64, above=0)  # transitions of each of them
-    context_size: int = setting(32, above=0)  # largest number of transitions of a context
+    batch_size: int = setting(32, above=0)  # transitions of each of them
+    context_size: int = setting(16, above=0)  # largest number of transitions of a context
     lr: float = setting(1e-3, above=0)  # that of the divergence's classifier is a third of it
     divergence_weight: float = setting(100.0, at_least=0)  # at the start
     data: str = setting("all", choices=DATA)
@@ -224,7 +224,7 @@ def _train_focal(run: Run, peer: PeerJob, report: Report) -> None:
     data = peer_data(run, focal.data)
     own = [run.transitions(name, "train") for name in run.names]
     torch.manual_seed(run.seed("families", peer.name))
-    options = {
+    options: dict[str, Any] = {
         "num_tasks": len(data),
         "num_cells": run.settings.distill.num_cells,
         **sizes_of(data[0]),
