@@ -54,10 +54,10 @@ DATA = ("all", "demonstrations")
 class FocalSettings:
     """Training of FOCAL."""
 
-    updates: int = setting(3000, above=0)
+    updates: int = setting(2500, above=0)
     tasks_per_update: int = setting(16, above=1)  # trained members in an update, at random
-    batch_size: int = setting(64, above=0)  # transitions of each of them
-    context_size: int = setting(32, above=0)  # largest number of transitions of a context
+    batch_size: int = setting(32, above=0)  # transitions of each of them
+    context_size: int = setting(16, above=0)  # largest number of transitions of a context
     lr: float = setting(1e-3, above=0)  # that of the divergence's classifier is a third of it
     divergence_weight: float = setting(100.0, at_least=0)  # at the start
     data: str = setting("all", choices=DATA)
