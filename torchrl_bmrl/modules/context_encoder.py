@@ -28,8 +28,10 @@ from torchrl_bmrl.modules.task_latent import (
 CONTEXT_KEYS = tuple(unravel_key((CONTEXT, key)) for key in (*TRANSITION_KEYS, "mask"))
 """Keys that a context encoder reads."""
 POOLINGS = ("mean", "attention")
-CONSTANT = 1e-3
-"""A number whose variance within tasks is a smaller share of that between tasks is not read."""
+MARK = 1e-2
+"""A number marks a task if its variance at the start is a smaller share of that between tasks."""
+SAME = 1e-4
+"""Variance between tasks below which their starts count as equal, of normalised observations."""
 
 
 class ContextNetwork(nn.Module):
@@ -100,18 +102,19 @@ class ContextNetwork(nn.Module):
     def set_scales(self, *datasets: TensorDictBase) -> None:
         """Sets the buffers, so that rewards and steps are as large as the rest of the input.
 
-        Numbers of the observation that stay the same in each data set and differ between them, such
-        as the place of an object that nothing moves, are not read. An encoder could know each
-        trained task by them, and then would not learn to read what tells a new task.
+        Numbers of the observation that tell the data sets apart in the first ``step`` of episodes,
+        such as where an object lies, are not read. An encoder could know each trained task by them,
+        and then would not learn to read what tells a new task.
 
         Args:
             *datasets: transitions of all tasks and behaviours, ``[N_i]`` each.
         """
-        seen = [data["observation"].double() for data in datasets]
-        within = torch.stack([each.var(0, correction=0) for each in seen]).mean(0)
-        between = torch.stack([each.mean(0) for each in seen]).var(0, correction=0)
-        # Rounding alone tells nothing apart.
-        self.read.copy_((within >= CONSTANT * between) | (between < 1e-6))
+        self.read.fill_(1.0)
+        if all("step" in data for data in datasets):
+            starts = [data["observation"][data["step"] == 0].double() for data in datasets]
+            within = torch.stack([start.var(0, correction=0) for start in starts]).mean(0)
+            between = torch.stack([start.mean(0) for start in starts]).var(0, correction=0)
+            self.read[(within < MARK * between) & (between > SAME)] = 0.0
         steps = torch.cat([x["next", "observation"] - x["observation"] for x in datasets])
         reward = torch.cat([x["next", "reward"] for x in datasets])
         several = int(len(steps) > 1)  # one transition has no deviation
