@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torchrl_bmrl.context_keys import CONTEXT, reads_context
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.modules.generator import Network, make_mlp
-from torchrl_bmrl.modules.scales import set_scales
+from torchrl_bmrl.modules.scales import set_scales, unmarked
 from torchrl_bmrl.modules.task_latent import (
     TRANSITION_KEYS,
     PrototypeTaskLatent,
@@ -29,8 +29,6 @@ from torchrl_bmrl.modules.task_latent import (
 CONTEXT_KEYS = tuple(unravel_key((CONTEXT, key)) for key in (*TRANSITION_KEYS, "mask"))
 """Keys that a context encoder reads."""
 POOLINGS = ("mean", "attention")
-CONSTANT = 1e-3
-"""A number whose variance within tasks is a smaller share of that between tasks is not read."""
 
 
 class ContextNetwork(nn.Module):
@@ -101,17 +99,14 @@ class ContextNetwork(nn.Module):
     def set_scales(self, *datasets: TensorDictBase) -> None:
         """Sets the buffers, so that rewards and steps are as large as the rest of the input.
 
-        Numbers of the observation that stay the same in each data set and differ between them, such
-        as the place of an object that nothing moves, are not read. An encoder could know each
-        trained task by them, and then would not learn to read what tells a new task.
+        Numbers of the observation that tell the data sets apart in the first ``step`` of episodes,
+        such as where an object lies, are not read. An encoder could know each trained task by them,
+        and then would not learn to read what tells a new task.
 
         Args:
             *datasets: transitions of all tasks and behaviours, ``[N_i]`` each.
         """
-        seen = [data["observation"].double() for data in datasets]
-        within = torch.stack([each.var(0, correction=0) for each in seen]).mean(0)
-        between = torch.stack([each.mean(0) for each in seen]).var(0, correction=0)
-        self.read.copy_((within >= CONSTANT * between) | (between < 1e-6))  # rounding tells nothing
+        self.read.copy_(unmarked(*datasets))
         set_scales(self, *datasets)
 
     def combine(self, features: Tensor, mask: Tensor) -> Tensor:

@@ -6,6 +6,12 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
+
+MARK = 1e-2
+"""A number marks a task if its variance at the start is a smaller share of that between tasks."""
+SAME = 1e-4
+"""Variance between tasks below which their starts count as equal, of normalised observations."""
 
 
 def set_scales(network: Any, *datasets: TensorDictBase) -> None:
@@ -27,3 +33,24 @@ def set_scales(network: Any, *datasets: TensorDictBase) -> None:
     network.reward_loc.copy_(reward.mean(0))
     deviation = reward.std(0, correction=several)
     network.reward_scale.copy_(torch.where(deviation > 0, deviation, 1.0))
+
+
+def unmarked(*datasets: TensorDictBase) -> Tensor:
+    """Which numbers of the observation may be read, 1, and which are marks of a task, 0.
+
+    A mark has one value at the start of all episodes of a task and another one in another task,
+    such as the place of an object. Without ``step`` in the data, no mark is found.
+
+    Args:
+        *datasets: transitions of each task or behaviour, ``[N_i]`` each.
+
+    Returns:
+        ``(obs_dim,)``.
+    """
+    read = torch.ones(datasets[0]["observation"].shape[-1])
+    if all("step" in data for data in datasets):
+        starts = [data["observation"][data["step"] == 0].double() for data in datasets]
+        within = torch.stack([start.var(0, correction=0) for start in starts]).mean(0)
+        between = torch.stack([start.mean(0) for start in starts]).var(0, correction=0)
+        read[(within < MARK * between) & (between > SAME)] = 0.0
+    return read
