@@ -20,6 +20,7 @@ from torchrl_bmrl.objectives.base import KeyedLoss
 from torchrl_bmrl.objectives.checks import check_choice, check_number
 from torchrl_bmrl.objectives.data import check_same_shape, check_tasks, entry, next_key, select
 from torchrl_bmrl.objectives.ensemble import FrozenEnsemble
+from torchrl_bmrl.objectives.lessons import draw_mix, taught_by
 from torchrl_bmrl.objectives.sizes import is_lazy, shapes_of, warm_up
 from torchrl_bmrl.objectives.student_terms import (
     advantage,
@@ -103,6 +104,9 @@ class MetaDistillationLoss(KeyedLoss):
         context_fraction: share of each batch that uses ``context``; the rest uses ``"current"``.
             With an encoder of sets 1.
         context_size: transitions in a set; for an encoder of sets the largest number.
+        mixing_fraction: share of the rows whose m and targets are mixed with another task's:
+            :math:`\lambda m_i + (1 - \lambda) m_j` learns :math:`\lambda g_i + (1 - \lambda) g_j`
+            and the same of the values, λ uniform in [0, 1].
         **options: of :class:`~torchrl_bmrl.objectives.KeyedLoss`: ``reduction``,
             ``deactivate_vmap`` (runs the teachers in a loop), ``use_prioritized_weights``.
 
@@ -198,6 +202,7 @@ class MetaDistillationLoss(KeyedLoss):
         context: str = "set",
         context_fraction: float = 0.5,
         context_size: int = 8,
+        mixing_fraction: float = 0.0,
         **options: Any,
     ) -> None:
         super().__init__(**options)
@@ -208,10 +213,12 @@ class MetaDistillationLoss(KeyedLoss):
         self.context = check_choice("context", context, CONTEXTS)
         self.context_fraction = check_number("context_fraction", context_fraction, 0, 1)
         self.context_size = check_number("context_size", context_size, 1, integer=True)
+        self.mixing_fraction = check_number("mixing_fraction", mixing_fraction, 0, 1)
         self.metric_margin = check_number("metric_margin", metric_margin)
         self.temperature = check_number("temperature", temperature, 1e-6)
         self.reads_sets = reads_context(task_encoder)
-        check_options(self, isometry_weight, (metric_weight, distance_weight, contrastive_weight))
+        arranging = (metric_weight, distance_weight, contrastive_weight, mixing_fraction)
+        check_options(self, isometry_weight, arranging)
         names = ("task_encoder", "task_classifier", "student_generator", "student_qvalue_network")
         networks = (task_encoder, task_classifier, student_generator, student_qvalue_network)
         pairs = zip(names, networks, strict=True)
@@ -317,26 +324,7 @@ class MetaDistillationLoss(KeyedLoss):
             check_same_shape(key, like, output)
         return output
 
-    @torch.no_grad()
-    def teach(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """States, fresh latents, and the teachers' actions and normalised values for them."""
-        keys = self.tensor_keys
-        shape = (*tensordict.batch_size, self.latent_dim)
-        clip, like = self.latent_clip, self._type_and_device
-        latent = functional.sample_action_latent(shape, latent_clip=clip, **like)
-        data = self._ask(self.teacher_qvalue_networks, self._demonstrate(tensordict, latent))
-        value = data.get(keys.state_action_value)
-        value = (value - self.qvalue_loc[:, None, None]) / self.qvalue_scale[:, None, None]
-        return data.set(keys.state_action_value, value)
-
-    def _demonstrate(self, tensordict: TensorDictBase, latent: Tensor) -> TensorDictBase:
-        """States, latents, and the actions that the teachers decode from them."""
-        data = self._entries(tensordict, self._teacher_observation_keys)
-        data = data.copy().set(self.tensor_keys.action_latent, latent)
-        return self._ask(self.teacher_generators, data)
-
-    def _ask(self, teachers: Any, data: TensorDictBase) -> TensorDictBase:
-        return teachers(data, randomness=self.vmap_randomness, loop=self.deactivate_vmap)
+    teach = torch.no_grad()(taught_by)  # the same
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -356,13 +344,16 @@ class MetaDistillationLoss(KeyedLoss):
         task = entry(tensordict, keys.task, valid)
         check_tasks(keys.task, task, batch, valid)
         m, points, points_valid = self._embed(tensordict)
+        mix = draw_mix(m, valid, self.mixing_fraction) if self.mixing_fraction else None
+        own, m = m, m if mix is None else mix.between(m)
         # M receives the gradients of the chosen terms only.
         reaching = {term: m if term in self.encoder_terms else m.detach() for term in ENCODER_TERMS}
         terms, metrics = {}, {}
         if self.classifies:
-            error, metrics["accuracy"] = classify(self, reaching["classification"], task, valid)
+            read = own if "classification" in self.encoder_terms else own.detach()
+            error, metrics["accuracy"] = classify(self, read, task, valid)
             terms["loss_classification"] = self.classification_weight * error
-        taught = self.teach(tensordict)
+        taught = self.teach(tensordict, mix)
         states = taught.select(*self._teacher_observation_keys)
         target, target_value = taught.get(keys.action), taught.get(keys.state_action_value)
 
@@ -377,7 +368,7 @@ class MetaDistillationLoss(KeyedLoss):
         key = keys.state_action_value
         value = self._run("student_qvalue_network", states, key, target_value, given)
         error = (value - target_value).squeeze(-1)
-        norm = m.square().sum(-1)
+        norm = own.square().sum(-1)
         terms |= {
             "loss_generator": self.generator_weight * functional.squared_error(action, target),
             "loss_direction": self.direction_weight * functional.direction_error(directed, target),
@@ -391,7 +382,7 @@ class MetaDistillationLoss(KeyedLoss):
         if self.isometry_weight is not None:
             terms["loss_isometry"] = self.isometry_weight * isometry(self, tensordict)
         if self.advantage_weight is not None:
-            error = advantage(self, tensordict, value, target_value, reaching["qvalue"])
+            error = advantage(self, tensordict, value, target_value, reaching["qvalue"], mix)
             terms["loss_advantage"] = self.advantage_weight * error
         priority = sum(terms.values()).detach()
         tensordict.set(self.tensor_keys.priority, functional.unpadded(priority, valid))

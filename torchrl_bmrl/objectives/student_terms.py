@@ -18,6 +18,7 @@ from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.objectives.context_rows import encode_contexts
 from torchrl_bmrl.objectives.contexts import assign, group_rows, which_count
 from torchrl_bmrl.objectives.data import entry, next_key
+from torchrl_bmrl.objectives.lessons import Mix, demonstrate
 from torchrl_bmrl.objectives.task_rows import draw_others, draw_rows
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def isometry(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> Tensor:
     # The latent 0 gives the demonstrator's action without its noise.
     centre = loss.qvalue_loc.new_zeros(*tensordict.batch_size, loss.latent_dim)
     with torch.no_grad():
-        action = loss._demonstrate(tensordict, centre).get(loss.tensor_keys.action)
+        action = demonstrate(loss, tensordict, centre).get(loss.tensor_keys.action)
     content = torch.cat([reward / loss.reward_scale[:, None, None], action], -1)
     # Not embed(): a set has no reward and action of its own.
     return functional.isometry_error(loss._encode(tensordict), content, valid)
@@ -48,6 +49,7 @@ def advantage(
     value: Tensor,
     target: Tensor,
     m: Tensor,
+    mix: Mix | None,
 ) -> Tensor:
     """Error of each row's difference in value between its latent and another, ``(num_tasks, B)``.
 
@@ -57,8 +59,9 @@ def advantage(
         value: the student's value of each row's own latent, ``(num_tasks, B, 1)``.
         target: the teachers', normalised.
         m: embedding of each row, which receives a gradient if it needs one.
+        mix: of the tasks, as for the target.
     """
-    keys, taught = loss.tensor_keys, loss.teach(tensordict)
+    keys, taught = loss.tensor_keys, loss.teach(tensordict, mix)
     states = taught.select(*loss._teacher_observation_keys)
     given = {keys.action_latent: taught.get(keys.action_latent), keys.task_latent: m}
     with torch.no_grad():
@@ -92,7 +95,8 @@ def check_options(
     """
     if any(arranging) and loss.num_tasks < 2:
         raise BMRLError(
-            "metric_weight, distance_weight and contrastive_weight need at least two tasks"
+            "metric_weight, distance_weight, contrastive_weight and mixing_fraction need at least "
+            "two tasks"
         )
     if not loss.reads_sets:
         if loss.context == "given":

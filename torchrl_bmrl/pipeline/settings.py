@@ -129,6 +129,8 @@ class DistillSettings:
     context: str = setting("set", choices=CONTEXTS)  # transitions that m is computed from
     context_fraction: float = setting(0.5, at_least=0, at_most=1)  # share of set contexts
     context_size: int = setting(8, above=0)  # transitions in a set
+    # Share of the rows whose m and targets are mixed with those of another task.
+    mixing_fraction: float = setting(0.0, at_least=0, at_most=1)
     # Terms whose gradient trains the encoder.
     encoder_terms: list[str] = setting(list(ENCODER_TERMS), choices=ENCODER_TERMS)
     # Weight of the task's cross-entropy; null: no classifier.

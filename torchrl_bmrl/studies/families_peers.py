@@ -59,7 +59,7 @@ class FocalSettings:
     batch_size: int = setting(32, above=0)  # transitions of each of them
     context_size: int = setting(16, above=0)  # largest number of transitions of a context
     lr: float = setting(1e-3, above=0)  # that of the divergence's classifier is a third of it
-    divergence_weight: float = setting(100.0, at_least=0)  # at the start
+    divergence_weight: float = setting(10.0, at_least=0)  # at the start
     data: str = setting("all", choices=DATA)
 
     @property
