@@ -14,7 +14,8 @@ from command import add_section, run_recipe
 import hydra
 from omegaconf import DictConfig
 
-from torchrl_bmrl.studies.families import FamilySettings, generalise
+from torchrl_bmrl.studies.families import generalise
+from torchrl_bmrl.studies.families_methods import FamilySettings
 
 add_section("families", FamilySettings)
 

@@ -103,7 +103,7 @@ def check(settings: Settings) -> Run:
         ("bcq.seeds=0", "bcq.seeds is 0"),
         (("only=[lift]", "bcq.stacked=true"), "only is .*; valid with bcq.stacked: null"),
         ("device=gpu", "device is 'gpu'; valid: one that torch can use"),
-        ("bcq.eval_episodes=0", "bcq.eval_episodes is 0"),
+        ("bcq.eval_episodes=-1", "bcq.eval_episodes is -1"),
         ("evaluate.episodes=-1", "evaluate.episodes is -1"),
         ("checkpoint_interval=0", "checkpoint_interval is 0"),
     ],
@@ -177,8 +177,9 @@ PRESETS = sorted(path.stem for path in (RECIPES / "config" / "preset").glob("*.y
 def test_every_preset_is_complete_and_valid(recipes: Any, tmp_path: Path, preset: str) -> None:
     settings = settings_of(f"preset={preset}", f"run_dir={tmp_path}")
     settings.check()
-    if preset == "family":
-        assert Run(settings).family.name == "push_towards"
+    families = {"family": "push_towards", "ml1": "ml1_reach"}
+    if preset in families:
+        assert Run(settings).family.name == families[preset]
         return
     assert list(Run(settings).names) == [
         "reach",

@@ -335,6 +335,28 @@ def test_a_given_context_may_differ_between_environments() -> None:
         growing("attention", context, 3)[0].reset()
 
 
+@each_pooling
+def test_what_does_not_count_in_a_given_context_is_not_read(pooling: str) -> None:
+    torch.manual_seed(0)
+    context = some(2, 5, dtype=torch.float32)
+    mask = torch.tensor([[True, True, False, False, False], [True, False, True, False, False]])
+    context["observation"][~mask] = torch.nan
+    encoder = make_encoder(pooling, torch.float32)
+    source = ContextTaskLatent(START, encoder, context, mask)
+    env = TransformedEnv(Walk((2,)), source)
+    data = env.reset()
+    for i in range(2):
+        own = embed_context(encoder, context[i][mask[i]])
+        torch.testing.assert_close(data["task_latent"][i], own)
+    data = env.step(env.rand_action(data))["next"]
+    reset = torch.tensor([[True], [False]])
+    again = env.reset(data.exclude("reward").set("_reset", reset))["task_latent"]
+    torch.testing.assert_close(again[0], embed_context(encoder, context[0][mask[0]]))
+    assert not torch.equal(again[1], embed_context(encoder, context[1][mask[1]]))
+    with pytest.raises(BMRLError, match=r"the mask is torch.bool of shape \[5\]; valid"):
+        ContextTaskLatent(START, encoder, context, mask[0])
+
+
 def test_an_episode_sends_no_gradient_and_the_spec_has_m() -> None:
     env, _ = growing()
     assert not env.rollout(3)["task_latent"].requires_grad

@@ -80,9 +80,9 @@ def test_the_told_parameter_is_scaled_to_one_over_the_trained_members():
     assert min(told) == -1
     assert max(told) == 1
     assert family.told(family.tasks("outside")[-1].name)[0] > 1
-    cosine, sine = get_family("push_towards").told("push_towards_90")
-    assert abs(cosine) < 1e-9
-    assert sine == 1
+    cosine, sine = get_family("push_towards").told("push_towards_60")
+    assert cosine == pytest.approx(0.5)
+    assert sine == pytest.approx(3**0.5 / 2)
 
 
 @pytest.mark.parametrize(

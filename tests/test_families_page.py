@@ -182,7 +182,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 def studied(run: Any) -> dict[str, Any]:
     """The explorer's data after the study."""
-    from torchrl_bmrl.studies.families import FamilySettings, generalise
+    from torchrl_bmrl.studies.families import generalise
+    from torchrl_bmrl.studies.families_methods import FamilySettings
 
     generalise(run, FamilySettings(episodes=1, methods=["demonstration"]))
     return json.loads((run.folder / "figures" / "families.json").read_text())["content"]

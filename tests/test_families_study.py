@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import shutil
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,20 +25,20 @@ import tiny_family
 from small_runs import contents
 from tiny_family import FAMILY, HORIZON, make_walk
 
-from torchrl_bmrl.data.robomimic import open_episodes, read_kept_episode
+from torchrl_bmrl.data.robomimic import read_kept_episode
 from torchrl_bmrl.errors import BMRLError, ConfigError
 from torchrl_bmrl.evaluation import read_results
-from torchrl_bmrl.experts.collect import WANDERING
 from torchrl_bmrl.files import write_rows
-from torchrl_bmrl.pipeline import Run, collect, evaluate, stage2, two_stage
+from torchrl_bmrl.pipeline import Run, evaluate, stage2, two_stage
 from torchrl_bmrl.pipeline.export import export
 from torchrl_bmrl.pipeline.student import load_student
-from torchrl_bmrl.studies import families
-from torchrl_bmrl.studies.families import METHODS, FamilySettings, generalise, make_method
+from torchrl_bmrl.studies import families, families_methods
+from torchrl_bmrl.studies.families import generalise
+from torchrl_bmrl.studies.families_methods import METHODS, OWN, make_method
 from torchrl_bmrl.tasks import FAMILIES
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
-STUDY = FamilySettings(episodes=2, cloning_updates=3)
+STUDY = tiny_family.study()
 HELD_OUT = ("walk_60", "walk_150")
 
 
@@ -108,17 +109,13 @@ def test_a_row_has_the_return_of_the_demonstration_that_the_policy_is_given(
     studied: tuple[Path, str],
 ) -> None:
     for row in rows(studied[0] / "families" / "results.csv"):
-        path = studied[0] / "families" / "contexts" / f"{row['member']}-demonstration-0.npz"
-        given = read_kept_episode(path)
+        file = f"{row['member']}-demonstration-{row['episode']}.npz"
+        given = read_kept_episode(studied[0] / "families" / "contexts" / file)
         assert float(row["data_return"]) == pytest.approx(given.rewards.sum(), rel=1e-6)
         assert row["family"] == "walk"
     run = Run(configured(studied[0]))
-    assert (
-        families.data_return(
-            run, STUDY, replace(make_walk(60.0), record=None, files=("walk.hdf5",))
-        )
-        == ""
-    )
+    without = replace(make_walk(60.0), record=None, files=("walk.hdf5",))
+    assert families.data_return(run, STUDY, without, 0) == ""
 
 
 def test_a_study_of_an_earlier_version_gets_the_new_columns_without_playing(
@@ -167,7 +164,7 @@ def test_a_study_that_was_stopped_goes_on_to_the_same_files(
     (folder / "families" / "one_shot" / "walk_60.csv").unlink()
     with Run(configured(folder)) as run:
         assert generalise(run, STUDY) == said
-    assert played == 12 + 7 + 1
+    assert played == 12 + 15 + 1
     assert contents(folder, *patterns) == contents(studied[0], *patterns)
 
 
@@ -179,11 +176,11 @@ def test_a_study_is_held_to_its_own_settings(studied: tuple[Path, str]) -> None:
 def test_the_students_of_the_comparison_know_what_they_are_told(studied: tuple[Path, str]) -> None:
     run = Run(configured(studied[0]))
     _, told_m = make_method(run, STUDY, make_walk(60.0), "told")
-    assert told_m.tolist() == pytest.approx(FAMILY.told("walk_60"))
+    assert told_m.task_latent.tolist() == pytest.approx(FAMILY.told("walk_60"))
     _, near = make_method(run, STUDY, make_walk(150.0), "one_hot")
-    assert near.tolist() == [0, 0, 0, 1]  # 120 is the nearest
+    assert near.task_latent.tolist() == [0, 0, 0, 1]  # 120 is the nearest
     _, nothing = make_method(run, STUDY, make_walk(60.0), "no_context")
-    assert nothing.tolist() == [0]
+    assert nothing.task_latent.tolist() == [0]
     for method in ("told", "one_hot", "no_context"):
         student, metadata = load_student(
             studied[0] / "families" / method / "checkpoint.safetensors"
@@ -193,30 +190,50 @@ def test_the_students_of_the_comparison_know_what_they_are_told(studied: tuple[P
         assert metadata["updates"] == 4
 
 
-def test_m_of_a_demonstration_is_that_of_the_student_and_of_another_behaviour_is_inferred(
-    studied: tuple[Path, str],
-) -> None:
+def test_each_episode_is_given_contexts_of_its_own(studied: tuple[Path, str]) -> None:
     run = Run(configured(studied[0]))
     student = run.student()[0]
     task = make_walk(60.0)
     for method, reads in (("demonstration", student.embed_context), ("behaviour", student.infer)):
-        given = families.context(run, STUDY, task, method)
-        assert len(given) == HORIZON
-        torch.testing.assert_close(make_method(run, STUDY, task, method)[1], reads(given))
+        given = [families_methods.context(run, STUDY, task, method, i) for i in (0, 1)]
+        assert [len(each) for each in given] == [HORIZON, HORIZON]
+        assert not torch.equal(given[0]["action"], given[1]["action"])
+        _, source = make_method(run, STUDY, task, method)
+        points = torch.stack([reads(each) for each in given])
+        torch.testing.assert_close(source.task_latent, points)
     twice = replace(STUDY, demonstrations=2)
-    assert len(families.context(run, twice, task, "one_shot")) == 2 * HORIZON
+    second = families_methods.context(run, twice, task, "demonstration", 1)
+    assert len(second) == 2 * HORIZON
+    assert not torch.equal(second["action"][:HORIZON], given[1]["action"])
+
+
+def test_one_shot_starts_with_the_own_first_episode_and_reads_on(
+    studied: tuple[Path, str],
+) -> None:
+    run = Run(configured(studied[0]))
+    task = make_walk(60.0)
+    learner = families_methods.load_learner(run, STUDY, OWN)
+    source = families_methods.after_first_episodes(run, STUDY, task, learner)
+    with closing(run.make_env(task, source, num_envs=STUDY.episodes)) as env:
+        played = env.rollout(3, learner.policy)
+    assert source.counts.shape == (STUDY.episodes, HORIZON)
+    assert source.counts.all()
+    latents = played["task_latent"]
+    assert not torch.equal(latents[0, 0], latents[1, 0])  # of different first episodes
+    assert not torch.equal(latents[:, 0], latents[:, 2])
 
 
 def test_a_first_episode_tries_several_trained_members(studied: tuple[Path, str]) -> None:
     run = Run(configured(studied[0]))
-    student = run.student()[0]
-    latents = families.first_latents(run, student, make_walk(60.0), 0)
-    assert len(latents) == HORIZON
-    tried = {tuple(latent.tolist()) for latent in latents}
-    assert tried <= {tuple(point.tolist()) for point in student.prototypes}
-    assert len(tried) == min(WANDERING, len(student.prototypes))
-    others = [families.first_latents(run, student, make_walk(60.0), i) for i in range(1, 6)]
-    assert not all(torch.equal(latents, other) for other in others)
+    learner = families_methods.load_learner(run, STUDY, OWN)
+    six = replace(STUDY, episodes=6)
+    paths = families_methods.trying(run, six, make_walk(60.0), learner).points
+    assert paths.shape[:2] == (6, HORIZON)
+    for path in paths:
+        tried = {tuple(latent.tolist()) for latent in path}
+        assert tried <= {tuple(point.tolist()) for point in learner.prototypes}
+        assert len(tried) == min(families_methods.TRIED, len(learner.prototypes))
+    assert not all(torch.equal(paths[0], other) for other in paths[1:])
 
 
 def test_a_student_knows_how_large_rewards_and_steps_are(trained: Path) -> None:
@@ -240,14 +257,22 @@ def test_held_out_members_have_the_run_s_options(folder: Path) -> None:
 
 
 def test_a_run_without_contexts_of_another_behaviour_has_no_such_method(tmp_path: Path) -> None:
-    settings = tiny_family.settings(tmp_path, {"context": "set", "inference_updates": 0})
+    settings = tiny_family.settings(
+        tmp_path, {"context": "set", "inference_updates": 0, "reward_updates": 0}
+    )
     settings = replace(settings, collect=replace(settings.collect, context_episodes=0))
-    with Run(settings) as run:
-        with pytest.raises(BMRLError, match=r"checkpoint.safetensors"):
-            generalise(run, STUDY)  # no policy yet
-        collect(run)
-        for name in run.names:
-            assert set(masks(run.demonstrations(name))) == {"train", "valid"}
+    with Run(settings) as run, pytest.raises(BMRLError, match=r"checkpoint.safetensors"):
+        generalise(run, STUDY)  # no policy yet
+
+
+def test_members_without_pictures_are_points_alone_and_are_not_played(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(families, "why_no_films", lambda: "")
+    with Run(configured(folder)) as run:
+        found = families.explore(run, STUDY, families.held_out_members(run))
+    assert "the environments of these tasks make no pictures." in found.caption
+    assert not (folder / "families" / "films").exists()
 
 
 def test_tasks_of_no_family_are_refused(tmp_path: Path) -> None:
@@ -263,6 +288,7 @@ def test_a_policy_that_reads_no_transitions_cannot_be_given_any(
     for part in ("data", "bcq"):
         shutil.copytree(trained / part, tmp_path / part)
     told = {"task_encoder": "told", "context": "current", "inference_updates": 0}
+    told |= {"reward_updates": 0}
     with Run(configured(tmp_path, ["prototype"], distill=told)) as run:
         stage2(run)
         assert run.student()[0].prototypes.shape == (4, 2)
@@ -281,6 +307,15 @@ def test_every_source_of_m_is_evaluated_and_the_expert_s_contexts_are_not(traine
     experts = [row for row in found if row.policy == "expert" and row.task == "walk_0"]
     assert len(experts) == 3  # two to train on and one held out
     assert all(row.success for row in experts)
+
+
+def test_without_episodes_during_stage_1_a_run_has_no_curves(trained: Path, tmp_path: Path) -> None:
+    settings = configured(tmp_path)
+    with Run(replace(settings, bcq=replace(settings.bcq, eval_episodes=0))) as run:
+        two_stage(run)
+    assert not list(tmp_path.glob("bcq/*/evaluations.csv"))
+    assert "no evaluations were found" in (tmp_path / "report.html").read_text()
+    assert contents(tmp_path, "results.csv") == contents(trained, "results.csv")
 
 
 def test_no_accuracy_is_reported_without_a_classifier(trained: Path) -> None:
@@ -317,9 +352,9 @@ def again_rows(tmp_path: Path) -> Any:
     return read_results(tmp_path / "again" / "results.csv")
 
 
-@pytest.mark.parametrize("stop", [2, 4])
+@pytest.mark.parametrize(("stop", "updates"), [(2, 2), (4, 4), (7, 4)])
 def test_a_distillation_that_was_stopped_goes_on_to_the_same_student(
-    trained: Path, tmp_path: Path, stop: int
+    trained: Path, tmp_path: Path, stop: int, updates: int
 ) -> None:
     for part in ("data", "bcq"):
         shutil.copytree(trained / part, tmp_path / part)
@@ -333,55 +368,12 @@ def test_a_distillation_that_was_stopped_goes_on_to_the_same_student(
 
         with pytest.raises(KeyboardInterrupt):
             train_student((run, StudentJob(run.settings.distill, "distill")), report)
-        assert load_student(run.student_path)[1]["updates"] == stop
+        assert load_student(run.student_path)[1]["updates"] == updates
+        rewards = run.folder / "distill" / "rewards" / "checkpoint.safetensors"
+        assert rewards.exists() == (stop == 7)
         stage2(run)
     expected, found = (
         load_student(x / "distill" / "checkpoint.safetensors")[0].state_dict()
         for x in (trained, tmp_path)
     )
     assert all(torch.equal(found[key], value) for key, value in expected.items())
-
-
-# -- contexts of another behaviour -----------------------------------------------------------------
-
-
-def masks(path: Path) -> dict[str, int]:
-    found = {}
-    for name in ("train", "valid", "context"):
-        try:
-            with open_episodes(path, split=name, observation_keys=[]) as episodes:
-                found[name] = len(episodes)
-        except BMRLError:
-            continue
-    return found
-
-
-def test_context_episodes_are_of_other_members_experts_and_apart(trained: Path) -> None:
-    path = trained / "data" / "walk_40.hdf5"
-    assert masks(path) == {"train": 2, "valid": 1, "context": 2}
-    for split in ("train", "valid", "context"):
-        with open_episodes(path, split=split, observation_keys=[]) as episodes:
-            for _, episode in episodes.items():
-                like = str(episode.attributes.get("like", ""))
-                assert bool(like) == (split == "context")
-                assert "walk_40" not in like
-    run = Run(configured(trained))
-    first, second = (run.transitions("walk_40", split) for split in ("train", "context"))
-    assert len(first) == len(second) == 2 * HORIZON
-    # The data are normalised by the demonstrations alone.
-    every = torch.cat([run.transitions(name, "train")["observation"] for name in run.names])
-    torch.testing.assert_close(every.mean(0), torch.zeros(2), atol=1e-5, rtol=0)
-
-
-def test_the_number_of_context_episodes_does_not_change_the_demonstrations(
-    trained: Path, tmp_path: Path
-) -> None:
-    settings = tiny_family.settings(tmp_path, {"context": "set", "inference_updates": 0})
-    with Run(replace(settings, collect=replace(settings.collect, context_episodes=0))) as run:
-        collect(run)
-        for name in run.names:
-            mine, theirs = (
-                Run(configured(x)).transitions(name, "train") for x in (tmp_path, trained)
-            )
-            assert torch.equal(mine["action"], theirs["action"])
-            assert torch.equal(mine["observation"], theirs["observation"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.modules import as_context, make_context_encoder, make_task_encoder
@@ -100,6 +101,44 @@ def test_a_context_is_of_one_task_and_one_behaviour():
     assert 0.5 < torch.stack(single).mean() < 0.9  # most contexts are of one episode
 
 
+class Rewards(torch.nn.Module):
+    """The reward of task i is 1000 i plus what the motion says."""
+
+    def forward(self, observation, action):
+        task = torch.arange(len(action)).reshape(-1, 1, 1)
+        return (1000.0 * task + action[..., :1]).expand(*action.shape[:2], 2)
+
+
+def test_contexts_of_other_behaviour_are_often_other_tasks_with_the_own_task_s_rewards():
+    torch.manual_seed(0)
+    own, others = ([episodes(i, kind) for i in range(4)] for kind in (1, 2))
+    models = TensorDictModule(Rewards(), ["observation", "action"], ["reward_prediction"])
+    sample = ContextSampler(own, others, size=6, reward_models=models)
+    lent, lenders = [], set()
+    for _ in range(60):
+        context = sample()["context"]
+        reward = context["next", "reward"].squeeze(-1)
+        action = context["action"][..., 0]
+        for task in range(4):
+            recorded = others[task]["action"][:, 0]
+            assert torch.equal(reward[task, 0] // 10, torch.full((6,), 10.0 * task + 1))
+            for k in (1, 2):
+                relabelled = torch.isclose(reward[task, k], 1000 * task + action[task, k]).all()
+                kept = (reward[task, k] // 10 == 10 * task + 2).all()
+                assert relabelled != kept
+                lent.append(float(relabelled))
+                if kept:
+                    assert torch.isin(action[task, k], recorded).all()
+                else:
+                    lenders |= {
+                        (task, i)
+                        for i in range(4)
+                        if torch.isin(action[task, k], others[i]["action"][:, 0]).all()
+                    }
+    assert 0.6 < sum(lent) / len(lent) < 0.8
+    assert len(lenders) == 16  # each task lends to each
+
+
 def test_contexts_have_few_transitions_and_many_and_never_none():
     torch.manual_seed(0)
     data = [episodes(i, 1) for i in range(2)]
@@ -134,3 +173,38 @@ def test_scales_are_those_of_rewards_and_steps():
         assert torch.allclose(network.step_scale, torch.tensor([0.1, 2.0, 1.0]), rtol=0.4)
         assert abs(network.reward_loc.item() - 5) < 2
         assert abs(network.reward_scale.item() - 3) < 1
+
+
+def test_what_tells_tasks_apart_before_anything_is_done_is_not_read():
+    torch.manual_seed(0)
+    student = Student(
+        num_tasks=3, observation_dim=3, action_dim=2, task_encoder="set_attention", infers=True
+    )
+    tasks = [transitions(30) for _ in range(3)]
+    for i, data in enumerate(tasks):
+        data["step"] = torch.arange(30) % 10
+        data["observation"][::10, 1] = float(i)  # and later anything
+        data["observation"][::10, 2] = 5.0  # equal everywhere
+    student.set_scales(*tasks)
+    other, moved = tasks[0].clone(), tasks[0].clone()
+    for key in ("observation", ("next", "observation")):
+        other[key][:, 1] += 2.0
+        moved[key][:, 0] += 1.0
+    for encoder, m in (
+        (student.task_encoder, student.embed_context),
+        (student.context_encoder, student.infer),
+    ):
+        assert encoder.module.read.tolist() == [1, 0, 1]
+        torch.testing.assert_close(m(other), m(tasks[0]))  # the steps are rounded
+        assert not torch.equal(m(moved), m(tasks[0]))
+    for rest in ([tasks[0]], [data.exclude("step") for data in tasks]):  # nothing is told apart
+        student.set_scales(*rest)
+        assert student.task_encoder.module.read.tolist() == [1, 1, 1]
+
+
+def test_an_encoder_of_an_earlier_version_reads_everything():
+    encoder = make_context_encoder(3, 2, 4)
+    state = {name: x for name, x in encoder.state_dict().items() if not name.endswith("read")}
+    encoder.module.read.zero_()
+    encoder.load_state_dict(state)
+    assert encoder.module.read.tolist() == [1, 1, 1]

@@ -167,3 +167,26 @@ def test_the_student_finds_the_goals_of_contexts_also_of_tasks_it_was_not_traine
         action = extract_network(loss, "student_generator")(data)["action"]
         direction = torch.as_tensor(goals, dtype=torch.float32)
         assert (torch.cosine_similarity(action, direction) > 0.6).all()
+
+
+def test_reward_models_see_what_a_step_did_in_units_of_steps_and_rewards() -> None:
+    torch.manual_seed(0)
+    state, action = torch.randn(2, 500, 3), torch.rand(2, 500, 2)
+    step = 0.01 * torch.randn(2, 500, 3)
+    # Task i is paid for number i of the step, in large units.
+    reward = 1e5 + 1e6 * torch.stack([step[i, :, i] for i in range(2)]).unsqueeze(-1)
+    after = {"observation": state + step, "reward": reward}
+    data = TensorDict({"observation": state, "action": action, "next": after}, [2, 500])
+    models = modules.make_reward_models(2, 3, 2, num_models=2, num_cells=(32, 32), reads_next=True)
+    models.module.set_scales(*data)
+    torch.testing.assert_close(models.module.step_scale, step.reshape(-1, 3).std(0))
+    loss = RewardModelLoss(models)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
+    for _ in range(300):
+        optimizer.zero_grad()
+        value = loss(data.clone())["loss_reward"] / reward.var()
+        value.backward()
+        optimizer.step()
+    assert value < 0.02
+    blind = RewardModelLoss(modules.make_reward_models(2, 3, 2, num_models=2))
+    assert ("next", "observation") not in blind.in_keys

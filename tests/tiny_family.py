@@ -142,6 +142,7 @@ def settings(folder: Path, distill: dict[str, Any] | None = None, **changes: Any
     small = {
         "updates": 4,
         "inference_updates": 2,
+        "reward_updates": 3,
         "batch_size": 8,
         "num_cells": [16],
         "task_encoder": "set_attention",
@@ -172,6 +173,16 @@ def settings(folder: Path, distill: dict[str, Any] | None = None, **changes: Any
         ),
         **changes,
     )
+
+
+def study(**changes: Any) -> Any:
+    """Settings of the smallest study of held-out members, with every method."""
+    from torchrl_bmrl.studies.families_methods import FamilySettings
+    from torchrl_bmrl.studies.families_peers import FocalSettings, MBMLSettings
+
+    small: dict[str, Any] = {"updates": 4, "batch_size": 8, "context_size": 4}
+    peers = {"focal": FocalSettings(**small), "mbml": MBMLSettings(**small, reward_updates=2)}
+    return FamilySettings(**{"episodes": 2, "cloning_updates": 3, **peers, **changes})
 
 
 def register() -> None:

@@ -87,10 +87,10 @@ class PushTowards(_Hidden):
         }
 
     def success(self, scene: TabletopScene) -> bool:
-        """The cube moved 7 cm along the direction, and at most half as far sideways."""
+        """The cube moved 7 cm along the direction, and at most a third as far sideways."""
         along = float(scene.cube_displacement @ self.unit)
         sideways = float(np.linalg.norm(scene.cube_displacement - along * self.unit))
-        return along > PUSH_SUCCESS_DISTANCE and sideways <= along / 2
+        return along > PUSH_SUCCESS_DISTANCE and sideways <= along / 3
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
 
@@ -130,14 +131,29 @@ def evaluate_policy(
     for first in range(0, len(seeds), size):
         part = seeds[first : first + size]
         data = rollout_episodes(env, policy, seed=part, max_steps=max_steps, report=report)
-        after = data.get("next").reshape(len(part), -1)
-        done = after.get("done").squeeze(-1).long()
-        playing = done.cumsum(-1) - done == 0  # up to the last step of the episode
+        data = data.reshape(len(part), -1)
+        after, playing = data.get("next"), still_playing(data)
         returns = (after.get("reward").double().squeeze(-1) * playing).sum(-1).tolist()
         successes: list[bool | None] = [None] * len(part)
         if (success := after.get("success", None)) is not None:
             successes = (success.reshape(len(part), -1) & playing).any(-1).tolist()
-        stages = after.get("stage", torch.zeros_like(done)).reshape(len(part), -1).amax(-1)
+        stages = after.get("stage", playing.long() * 0).reshape(len(part), -1).amax(-1)
         rows = zip(returns, successes, stages.tolist(), strict=True)
         outcomes += [EpisodeOutcome(*row) for row in rows]
     return outcomes
+
+
+def still_playing(data: TensorDictBase) -> Tensor:
+    """Which steps belong to their episode: those up to its end, boolean, ``(*B, T)``.
+
+    Args:
+        data: trajectories of :func:`rollout_episodes`, ``[*B, T]``; what follows the end of an
+            episode before the others end is filled up.
+
+    Example:
+        >>> done = torch.tensor([False, True, True]).unsqueeze(-1)
+        >>> still_playing(TensorDict({"next": {"done": done}}, [3]))
+        tensor([ True,  True, False])
+    """
+    done = data.get(("next", "done")).squeeze(-1).long()
+    return done.cumsum(-1) - done == 0

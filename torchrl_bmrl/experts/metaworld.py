@@ -9,7 +9,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -263,10 +263,7 @@ def record_ml1_episode(
     for task in like:
         if task.options.get("env") != env:
             raise ConfigError(f"like is {task.name}; valid: tasks of {env}")
-        other = MetaWorldEnv(**task.options)
-        other.reset()
-        goals.append(other.observation_with_goal()[-3:])
-        other.close()
+        goals.append(_goal_of(env, tuple(task.options["rand_vec"])))
     made = MetaWorldEnv(env, rand_vec, horizon)
     rng = np.random.default_rng(derive_seed(seed, "action noise"))
     policy = ENV_POLICY_MAP[env]()
@@ -307,6 +304,19 @@ def record_ml1_episode(
             },
         },
     )
+
+
+@cache  # a simulator takes as long to make as a third of an episode
+def _goal_of(env: str, rand_vec: Vector) -> np.ndarray:
+    """Where the goal of a task lies [m]."""
+    from torchrl_bmrl.envs.metaworld import MetaWorldEnv
+
+    made = MetaWorldEnv(env, rand_vec)
+    made.reset()
+    goal = made.observation_with_goal()[-3:]
+    made.close()
+    goal.flags.writeable = False
+    return goal
 
 
 registered_families()  # the Sawyer's come first, whatever is imported first

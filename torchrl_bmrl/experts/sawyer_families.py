@@ -202,9 +202,9 @@ register_family(
         name="push_towards",
         parameters=("direction [°]",),
         members={
-            "train": [(angle,) for angle in range(0, 271, 30)],
-            "inside": [(angle,) for angle in range(15, 270, 30)],
-            "outside": [(angle,) for angle in range(285, 360, 15)],
+            "train": [(angle,) for angle in range(0, 281, 40)],
+            "inside": [(angle,) for angle in range(20, 280, 40)],
+            "outside": [(angle,) for angle in (300, 310, 320, 330, 340)],
         },
         make=partial(make_member, "push_towards"),
         measure=pushed_direction,

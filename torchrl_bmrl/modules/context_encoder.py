@@ -7,7 +7,7 @@ stored transitions, :class:`ContextTaskLatent` collects one while a policy acts.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torchrl_bmrl.context_keys import CONTEXT, reads_context
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.modules.generator import Network, make_mlp
+from torchrl_bmrl.modules.scales import set_scales, unmarked
 from torchrl_bmrl.modules.task_latent import (
     TRANSITION_KEYS,
     PrototypeTaskLatent,
@@ -54,8 +55,10 @@ class ContextNetwork(nn.Module):
             step is much smaller than the spread of the observations that a network is made for.
         reward_loc: μ, ``(1,)``.
         reward_scale: ρ, ``(1,)``.
+        read: which numbers of the observation are read, 1, or not, 0, ``(obs_dim,)``.
     """
 
+    read: Tensor
     step_scale: Tensor
     reward_loc: Tensor
     reward_scale: Tensor
@@ -70,6 +73,7 @@ class ContextNetwork(nn.Module):
         num_cells: Sequence[int],
     ) -> None:
         super().__init__()
+        self.register_buffer("read", torch.ones(observation_dim))
         self.register_buffer("step_scale", torch.ones(observation_dim))
         self.register_buffer("reward_loc", torch.zeros(1))
         self.register_buffer("reward_scale", torch.ones(1))
@@ -84,24 +88,26 @@ class ContextNetwork(nn.Module):
         """φ and, with attention, ψ of each transition, ``(*B, K, n)``."""
         step = (following - observation) / self.step_scale
         reward = (reward - self.reward_loc) / self.reward_scale
-        return self.each(torch.cat([observation, action, reward, step], -1))
+        return self.each(torch.cat([observation * self.read, action, reward, step], -1))
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        # Checkpoints of earlier versions have encoders that read everything.
+        state_dict.setdefault(f"{prefix}read", torch.ones_like(self.read))
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     @torch.no_grad()
     def set_scales(self, *datasets: TensorDictBase) -> None:
         """Sets the buffers, so that rewards and steps are as large as the rest of the input.
 
+        Numbers of the observation that tell the data sets apart in the first ``step`` of episodes,
+        such as where an object lies, are not read. An encoder could know each trained task by them,
+        and then would not learn to read what tells a new task.
+
         Args:
             *datasets: transitions of all tasks and behaviours, ``[N_i]`` each.
         """
-        steps = torch.cat([x["next", "observation"] - x["observation"] for x in datasets])
-        reward = torch.cat([x["next", "reward"] for x in datasets])
-        several = int(len(steps) > 1)  # one transition has no deviation
-        # A number that hardly moves carries rounding errors, which must not be enlarged.
-        deviation = steps.double().std(0, correction=several)
-        self.step_scale.copy_(torch.where(deviation > 1e-3, deviation, 1.0))
-        self.reward_loc.copy_(reward.double().mean(0))
-        deviation = reward.double().std(0, correction=several)
-        self.reward_scale.copy_(torch.where(deviation > 0, deviation, 1.0))
+        self.read.copy_(unmarked(*datasets))
+        set_scales(self, *datasets)
 
     def combine(self, features: Tensor, mask: Tensor) -> Tensor:
         """m of the transitions that count, ``(*B, m)``.
@@ -257,6 +263,7 @@ class ContextTaskLatent(PrototypeTaskLatent):
         encoder: :func:`make_context_encoder`'s module, trained.
         context: transitions that the context starts with in each episode, batch ``[K]``, or
             ``[*B, K]`` for the environments of a batch; ``None`` for none.
+        mask: which of these count, boolean, ``(*B, K)``; ``None`` if all do.
 
     Raises:
         BMRLError: for an encoder of single transitions, or a context that :func:`as_context`
@@ -273,20 +280,28 @@ class ContextTaskLatent(PrototypeTaskLatent):
     """
 
     given: Tensor | None
+    counts: Tensor | None
 
     def __init__(
         self,
         task_latent: Tensor,
         encoder: TensorDictModule,
         context: TensorDictBase | None = None,
+        mask: Tensor | None = None,
     ) -> None:
         super().__init__(task_latent)
         if not reads_context(encoder):
             raise BMRLError("the encoder reads single transitions; valid: make_context_encoder")
         self.encoder = encoder
         self.network = cast(ContextNetwork, encoder.module)
-        given = None if context is None else self._features(as_context(context))
+        given = counts = None
+        if context is not None:
+            whole = as_context(context, mask)
+            counts = whole[CONTEXT, "mask"]
+            # What does not count may hold anything, also no numbers.
+            given = self._features(whole).masked_fill(~counts.unsqueeze(-1), 0)
         self.register_buffer("given", given)
+        self.register_buffer("counts", counts)
         self._kept: Tensor | None = None
         self._valid: Tensor | None = None
 
@@ -306,13 +321,13 @@ class ContextTaskLatent(PrototypeTaskLatent):
             number = torch.arange(self._valid.shape[-1], device=self._valid.device)
             valid = self._valid & ~(reset.reshape(*shape, 1) & (number >= given))
             # What counts nowhere any more would stay in memory for ever.
-            used = valid.reshape(-1, valid.shape[-1]).any(0)
+            used = valid.reshape(-1, valid.shape[-1]).any(0) | (number < given)
             self._kept, self._valid = self._kept[..., used, :], valid[..., used]
         return self._write(tensordict_reset)
 
     def _begin(self, shape: torch.Size) -> None:
         """All environments begin anew."""
-        if self.given is None:
+        if self.given is None or self.counts is None:
             self._kept = self._valid = None
             return
         batch = self.given.shape[:-2]
@@ -322,7 +337,7 @@ class ContextTaskLatent(PrototypeTaskLatent):
                 "one context, or one for each"
             )
         self._kept = self.given.expand(*shape, *self.given.shape[-2:])
-        self._valid = self._kept.new_ones(self._kept.shape[:-1], dtype=torch.bool)
+        self._valid = self.counts.expand(*shape, self.counts.shape[-1])
 
     def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
         shape = tensordict.batch_size

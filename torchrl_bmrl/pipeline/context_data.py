@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_bmrl.modules import as_context
@@ -13,18 +15,24 @@ from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 
 ONE_EPISODE = 0.7
 """Share of the contexts that are of one episode; the others mix the episodes of a behaviour."""
+RELABELLED = 0.7
+"""Share of the contexts of other behaviour that are another task's, with rewards of a model."""
 
 
 class ContextSampler:
     """Draws, for each task, one context of its demonstrations and two of another behaviour.
 
     A context leaves out a random share of its transitions, so that an encoder learns from few and
-    from many.
+    from many. With ``reward_models``, a context of other behaviour is often that of another task
+    with the rewards that the own task would give: the same motion then belongs to every task, and
+    only rewards tell the task.
 
     Args:
         own: demonstrations of each task, ``[N_i]`` each, with ``episode (N_i,)``.
         others: episodes of another behaviour, likewise.
         size: transitions of a context.
+        reward_models: of each task, :func:`torchrl_bmrl.modules.make_reward_models`'s module;
+            ``None`` for contexts as they were recorded.
 
     Example:
         >>> from tensordict import TensorDict
@@ -37,9 +45,13 @@ class ContextSampler:
     """
 
     def __init__(
-        self, own: Sequence[TensorDictBase], others: Sequence[TensorDictBase], size: int
+        self,
+        own: Sequence[TensorDictBase],
+        others: Sequence[TensorDictBase],
+        size: int,
+        reward_models: TensorDictModule | None = None,
     ) -> None:
-        self.size = size
+        self.size, self.reward_models = size, reward_models
         self.data = torch.cat([data.select(*TRANSITION_KEYS) for data in (*own, *others)])
         first, second = _episodes(own, 0), _episodes(others, sum(map(len, own)))
         self.behaviours = (first, second, second)
@@ -48,10 +60,25 @@ class ContextSampler:
         """Returns contexts, ``[num_tasks, 3]``."""
         rows = torch.stack([self._rows(*behaviour) for behaviour in self.behaviours], 1)
         contexts = self.data[rows]
+        if self.reward_models is not None:
+            contexts[:, 1:] = self._relabelled(rows[:, 1:], contexts[:, 1:])
         share = torch.rand(*rows.shape[:2], 1)
         mask = torch.rand(rows.shape) < share
         mask[..., 0] = True
         return as_context(contexts, mask)
+
+    @torch.no_grad()
+    def _relabelled(self, rows: Tensor, contexts: TensorDictBase) -> TensorDictBase:
+        """Contexts ``[num_tasks, C]``, of which some are lent by other tasks."""
+        assert self.reward_models is not None
+        shape = rows.shape[:2]
+        chosen = torch.rand(shape) < RELABELLED
+        lender = torch.randint(shape[0], shape)
+        lent = cast(TensorDictBase, self.data[rows[lender, torch.arange(shape[1])]])
+        read = lent.select(*self.reward_models.in_keys).flatten(1, 2)
+        reward = self.reward_models(read)["reward_prediction"].mean(-1, keepdim=True)
+        lent.set(("next", "reward"), reward.unflatten(1, rows.shape[1:]))
+        return torch.where(chosen.unsqueeze(-1), lent, contexts)
 
     def _rows(self, start: Tensor, length: Tensor, count: Tensor) -> Tensor:
         """Rows of one context of each task, ``(num_tasks, size)``."""

@@ -76,7 +76,7 @@ class BCQSettings:
 
     epochs: int = setting(5, above=0)  # the agents are evaluated after each
     updates_per_epoch: int = setting(1000, above=0)  # updates of each network
-    eval_episodes: int = setting(3, above=0)  # episodes after each epoch, for the curves
+    eval_episodes: int = setting(3, at_least=0)  # after each epoch, for the curves; 0: no curves
     batch_size: int = setting(128, above=0)  # transitions per update
     lr: float = setting(1e-3, above=0)  # learning rate of Adam
     cosine: bool = False  # the learning rate decays to zero
@@ -118,6 +118,8 @@ class DistillSettings:
     updates: int = setting(12_000, above=0)  # number of updates
     # Further updates, of an encoder that tells the task from any behaviour (context_episodes).
     inference_updates: int = setting(0, at_least=0)
+    # Before these, updates of models of each task's reward, which relabel its contexts; 0: none.
+    reward_updates: int = setting(0, at_least=0)
     batch_size: int = setting(64, above=0)  # transitions of each task per update
     lr: float = setting(1e-3, above=0)  # learning rate of Adam
     cosine: bool = True  # the learning rate decays to zero
@@ -161,10 +163,15 @@ class DistillSettings:
                 needs["context"] = "set or given"
             elif self.batch_size < 2 * self.context_size:
                 needs["batch_size"] = f"at least {2 * self.context_size}, two contexts"
-        else:
-            needs = {"inference_updates": 0} if self.inference_updates else {}
-            if self.context == "given":
-                needs["context"] = "another one, or an encoder of sets"
+        elif self.inference_updates:
+            needs = {"inference_updates": 0}
+        if self.reward_updates and not self.inference_updates:
+            raise ConfigError(
+                f"distill.reward_updates is {self.reward_updates} and distill.inference_updates 0; "
+                "valid: 0, or updates of the encoder that the models are for"
+            )
+        if self.task_encoder not in OF_SETS and self.context == "given":
+            needs["context"] = "another one, or an encoder of sets"
         if self.task_encoder in ("one_hot", "told", "nothing"):
             needs["isometry_weight"] = 0
             if latent_sources != ["prototype"]:

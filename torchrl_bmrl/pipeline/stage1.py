@@ -152,7 +152,7 @@ def train_agents(
             def end_epoch(update: int) -> None:
                 for name in trained.healthy:
                     _diagnose(run, trained, name, samples[name], loggers[name], update)
-                if run.playable:
+                if run.playable and bcq.eval_episodes:
                     _evaluate_epoch(run, trained, update)
 
             fit(

@@ -20,10 +20,12 @@ from torchrl_bmrl.modules import BCQPolicy, reads_context
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.objectives import ContextInferenceLoss
 from torchrl_bmrl.pipeline.context_data import ContextSampler
+from torchrl_bmrl.pipeline.rewards import models_for_contexts
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.settings import DistillSettings
 from torchrl_bmrl.pipeline.stage1 import sizes_of
 from torchrl_bmrl.pipeline.student import Student, make_distillation_loss
+from torchrl_bmrl.pipeline.training import make_update
 from torchrl_bmrl.pipeline.training_data import deviation
 from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
 from torchrl_bmrl.run.workers import Report
@@ -44,6 +46,7 @@ OF_THE_STUDENT = ("task_encoder", "task_latent_dim", "num_cells")
 OF_THE_TRAINING = (
     "updates",
     "inference_updates",
+    "reward_updates",
     "batch_size",
     "lr",
     "cosine",
@@ -74,7 +77,7 @@ def stage2(run: Run) -> None:
         train_student,
         [StudentJob(run.settings.distill, "distill")],
         workers=1,
-        total=run.settings.distill.updates + run.settings.distill.inference_updates,
+        total=all_updates(run.settings.distill),
         description="stage 2: distilling",
         unit="update",
     )
@@ -113,6 +116,11 @@ def advantage_scale(
         scales.append(nonzero_scale(spread, value.abs().max(), value.dtype))
     scale = torch.stack(scales)
     return scale if qvalue_scale is None else scale / qvalue_scale
+
+
+def all_updates(distill: DistillSettings) -> int:
+    """Returns the number of all updates of stage 2."""
+    return distill.updates + distill.inference_updates + distill.reward_updates
 
 
 @dataclass(frozen=True)
@@ -219,16 +227,10 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
         report(done)
     end = distill.updates + distill.inference_updates
     if done == end:
+        report(distill.reward_updates)
         return
-
-    def update(batch: TensorDictBase) -> dict[str, Tensor]:
-        losses = loss(batch)
-        total = sum(term for name, term in losses.items() if name.startswith("loss_"))
-        gradient_step(optimizers["student"], total)
-        return {name: value.detach() for name, value in losses.items()}
-
     accelerated = accelerate(
-        update,
+        make_update(loss, optimizers["student"]),
         compiled=settings.compile,
         captured=settings.cudagraphs,
         device=settings.device,
@@ -296,11 +298,16 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
         if distill.inference_updates:
             here = [data.to(settings.device) for data in train]
             student.set_prototypes(here, distill.prototype)
-            inference = Inference(student, optimizers["inference"], distill, train, others)
+            models = None
+            if distill.reward_updates:
+                every = [torch.cat(both) for both in zip(train, others, strict=True)]
+                models = models_for_contexts(run, student_job.folder, distill, every, report)
+            contexts = ContextSampler(train, others, distill.context_size, models)
+            inference = Inference(student, optimizers["inference"], distill)
             start = max(done, distill.updates)
             fit(
                 inference.step,
-                inference.sample,
+                contexts,
                 start=start,
                 total=end,
                 check=check_inference,
@@ -315,22 +322,12 @@ class Inference:
         student: with prototypes.
         optimizer: of its ``context_encoder``.
         distill: settings of stage 2.
-        train: demonstrations of each task.
-        others: episodes of another behaviour of each task.
     """
 
-    def __init__(
-        self,
-        student: Student,
-        optimizer: Adam,
-        distill: DistillSettings,
-        train: list[TensorDictBase],
-        others: list[TensorDictBase],
-    ) -> None:
+    def __init__(self, student: Student, optimizer: Adam, distill: DistillSettings) -> None:
         assert student.context_encoder is not None
         self.optimizer, self.distill = optimizer, distill
         self.loss = ContextInferenceLoss(student.context_encoder, student.prototypes)
-        self.sample = ContextSampler(train, others, distill.context_size)
 
     def step(self, number: int, batch: TensorDictBase) -> dict[str, Tensor]:
         """Does the update of a number, which goes on after those of the distillation."""

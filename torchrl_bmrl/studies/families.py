@@ -7,76 +7,47 @@ of another behaviour, its own first episode, the nearest trained member, or noth
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
-import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
-
-from torchrl_bmrl.data.episodes import as_tensordict
-from torchrl_bmrl.data.robomimic import keep_episode, read_kept_episode
-from torchrl_bmrl.envs.transforms import transform_data
 from torchrl_bmrl.errors import ConfigError
-from torchrl_bmrl.evaluation.rollout import rollout_episodes
-from torchrl_bmrl.experts.collect import WANDERING, others_than, record_success
 from torchrl_bmrl.families import SPLITS
 from torchrl_bmrl.files import number, read_rows, whole, write_rows
-from torchrl_bmrl.modules import BCQPolicy, PathTaskLatent, reads_context
+from torchrl_bmrl.modules import embed_context, reads_context
 from torchrl_bmrl.modules.task_latent import check_reads_transitions
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.settings import DistillSettings
 from torchrl_bmrl.pipeline.stage2 import StudentJob, train_student
-from torchrl_bmrl.pipeline.student import Student, load_student
 from torchrl_bmrl.pipeline.task_files import with_run_options
 from torchrl_bmrl.reports import Section, write_study
 from torchrl_bmrl.reports.explorer import StoredExplorer
 from torchrl_bmrl.reports.members import Member, explore_members
 from torchrl_bmrl.run.folder import open_run
-from torchrl_bmrl.run.settings import setting
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.studies.families_films import film_once, why_no_films
 from torchrl_bmrl.studies.families_line import LINES, POINTS, line_table, lines_of, play_line
+from torchrl_bmrl.studies.families_methods import (
+    METHODS,
+    OWN,
+    FamilySettings,
+    context,
+    load_learner,
+    make_method,
+)
+from torchrl_bmrl.studies.families_peers import PEERS, PeerJob, train_peer
 from torchrl_bmrl.studies.families_report import make_tables
-from torchrl_bmrl.studies.imitation import clone_behaviour
 from torchrl_bmrl.tasks import Task
 
 HELD_OUT = SPLITS[1:]
-METHODS = {
-    "told": "told the parameter",
-    "demonstration": "m of one demonstration",
-    "behaviour": "m of one episode of another behaviour",
-    "one_shot": "m of its own first episode",
-    "first": "the first episode itself",
-    "one_hot": "one-hot code of the nearest trained member",
-    "teacher": "agent of the nearest trained member",
-    "no_context": "told nothing",
-    "cloning": "behaviour cloning of one demonstration",
-}
-"""Policies that are compared; the nearest member is known by the true parameter."""
 _COLUMNS: dict[str, Any] = {
     **dict.fromkeys(("method", "split", "member"), str),
     "episode": whole,
     "return": number,
     "success": str,
 }
-
-
-@dataclass
-class FamilySettings:
-    """Settings of :func:`generalise`."""
-
-    episodes: int = setting(5, above=0)  # of each held-out member with each method
-    demonstrations: int = setting(1, above=0)  # episodes of a context
-    methods: list[str] = setting(list(METHODS), choices=tuple(METHODS), unique=True)  # to compare
-    cloning_updates: int = setting(2000, above=0)  # of behaviour cloning on the demonstration
-    folder: ClassVar[str] = "families"  # of the study, below the run's
-
-
 _OTHERS: dict[str, str] = {"told": "told", "one_hot": "one_hot", "no_context": "nothing"}
 """Encoders of the students that are trained for the comparison, by method."""
 
@@ -84,9 +55,10 @@ _OTHERS: dict[str, str] = {"told": "told", "one_hot": "one_hot", "no_context": "
 def generalise(run: Run, settings: FamilySettings) -> str:
     """Plays the held-out members of the run's family with every method.
 
-    Trains the students of the comparison first, and also plays points between trained members.
-    Writes ``families/results.csv`` and ``families/lines.csv`` with a table each, and the members in
-    the embedding for the page. Students and episodes that are there already are read back.
+    Trains the students and the published methods of the comparison first, and also plays points
+    between trained members. Writes ``families/results.csv`` and ``families/lines.csv`` with a table
+    each, and the members in the embedding for the page. Policies and episodes that are there
+    already are read back.
 
     Args:
         run: an open run with stage 2, whose tasks are the trained members of a family.
@@ -108,13 +80,27 @@ def generalise(run: Run, settings: FamilySettings) -> str:
         raise ConfigError(
             "families.methods has behaviour and collect.context_episodes is 0; valid: without it"
         )
-    others = [student_job(run, settings, name) for name in methods if name in _OTHERS]
+    others = [student_job(run, settings, name) for name in settings.learners if name in _OTHERS]
+    peers = [
+        PeerJob(name, getattr(settings, name), f"{settings.folder}/{name}")
+        for name in settings.learners
+        if name in PEERS
+    ]
+    for job in peers:
+        job.check(run)
     open_run(run.folder / settings.folder, asdict(settings))
     run.jobs(
         train_student,
         others,
         total=sum(job.settings.updates for job in others),
         description="training the students of the comparison",
+        unit="update",
+    )
+    run.jobs(
+        train_peer,
+        peers,
+        total=sum(job.settings.total for job in peers),
+        description="training the published methods",
         unit="update",
     )
     members = held_out_members(run)
@@ -184,6 +170,7 @@ def student_job(run: Run, settings: FamilySettings, method: str) -> StudentJob:
         "context": "current",
         "context_size": 1,
         "inference_updates": 0,
+        "reward_updates": 0,
         "isometry_weight": 0.0,
         "metric_weight": 0.0,
         "distance_weight": 0.0,
@@ -223,7 +210,9 @@ def look_at_member(
 ) -> Member:
     """m of a member's demonstration and, if wanted, an episode that is played with it."""
     run, (settings, split, task, filmed) = job
-    policy, latent = make_method(run, settings, task, "demonstration")
+    learner = load_learner(run, settings, OWN)
+    latent = embed_context(learner.encoder, context(run, settings, task, "demonstration", 0))
+    policy = learner.policy
     return Member(
         title=task.title,
         split=split,
@@ -250,21 +239,23 @@ def play_member(job: tuple[Run, Job], report: Report) -> list[dict[str, Any]]:
             skipped=partial(report, steps),
         )
     # Not in the files of the methods, so that studies of earlier versions get these columns, too.
-    more = {"family": run.family.name, "data_return": data_return(run, settings, task)}
-    return [row | more for row in rows]
+    returns = [data_return(run, settings, task, i) for i in range(settings.episodes)]
+    family = run.family.name
+    return [row | {"family": family, "data_return": returns[row["episode"]]} for row in rows]
 
 
-def data_return(run: Run, settings: FamilySettings, task: Task) -> float | str:
+def data_return(run: Run, settings: FamilySettings, task: Task, index: int) -> float | str:
     """Mean return of the demonstrations that a policy is given; "" for a task without an expert.
 
     Args:
         run: the run.
         settings: of the study.
         task: the member.
+        index: number of the episode.
     """
     if task.record is None:
         return ""
-    given = context(run, settings, task, "demonstration")
+    given = context(run, settings, task, "demonstration", index)
     return float(given["next", "reward"].double().sum()) / settings.demonstrations
 
 
@@ -278,9 +269,8 @@ def _play(
     path: Path,
 ) -> None:
     seeds = [run.seed("families", task.name, i) for i in range(settings.episodes)]
-    policy, latent = make_method(run, settings, task, method)
-    points = latent if latent.ndim > 1 else latent.unsqueeze(0)
-    outcomes = run.play(task, policy, PathTaskLatent(points), seeds=seeds, report=report)
+    policy, source = make_method(run, settings, task, method)
+    outcomes = run.play(task, policy, source, seeds=seeds, report=report)
     first = {"method": method, "split": split, "member": task.name}
     rows = [
         {
@@ -292,105 +282,3 @@ def _play(
         for i, outcome in enumerate(outcomes)
     ]
     write_rows(path, rows)
-
-
-def make_method(
-    run: Run, settings: FamilySettings, task: Task, method: str
-) -> tuple[TensorDictModuleBase, Tensor]:
-    """The policy of a method on a member, and its m: ``(m,)``, or ``(T, m)`` step by step.
-
-    Args:
-        run: the run.
-        settings: of the study.
-        task: the member.
-        method: one of :data:`METHODS`.
-    """
-    family = run.family
-    code = torch.tensor(family.told(task.name), dtype=torch.float32)
-    codes = torch.tensor(run.codes(), dtype=torch.float32)
-    nearest = int((codes - code).norm(dim=-1).argmin())
-    count = run.settings.evaluate.num_candidates
-    if method == "teacher":
-        teacher = BCQPolicy.frozen(run.teacher(run.names[nearest]), num_candidates=count)
-        return teacher, torch.zeros(1)
-    if method == "cloning":
-        data = context(run, settings, task, "demonstration")
-        seed = run.seed("families", "cloning", task.name)
-        return clone_behaviour(data, updates=settings.cloning_updates, seed=seed), torch.zeros(1)
-    if method in _OTHERS:
-        path = run.folder / settings.folder / method / "checkpoint.safetensors"
-        student, metadata = load_student(path)
-        latents = {"told": code, "one_hot": student.prototypes[nearest]}
-        latent = latents.get(method, student.prototypes[0])
-    else:
-        student, metadata = run.student()
-        if method == "first":
-            latent = first_latents(run, student, task, 0)
-        else:
-            given = context(run, settings, task, method)
-            reads = student.embed_context if method == "demonstration" else student.infer
-            latent = reads(given)
-    policy = student.policy(num_candidates=count, latent_clip=metadata["latent_clip"])
-    return policy, latent
-
-
-def first_latents(run: Run, student: Student, task: Task, index: int) -> Tensor:
-    """m of an episode before anything is known: of some trained members in turn, ``(T, m)``.
-
-    Args:
-        run: the run.
-        student: the student.
-        task: the member.
-        index: number of the episode.
-    """
-    generator = torch.Generator().manual_seed(run.seed("families", "sweep", task.name, index))
-    chosen = torch.randperm(len(student.prototypes), generator=generator)[:WANDERING]
-    horizon = run.horizon(task)
-    step = torch.arange(horizon) * len(chosen) // horizon
-    return student.prototypes[chosen[step]]
-
-
-def context(run: Run, settings: FamilySettings, task: Task, method: str) -> TensorDictBase:
-    """Transitions of a member that a policy is given, ``[K]``, normalised.
-
-    Args:
-        run: the run.
-        settings: of the study.
-        task: the member.
-        method: ``"demonstration"``, ``"behaviour"`` or ``"one_shot"``.
-    """
-    episodes: list[Any] = []
-    for i in range(settings.demonstrations):
-        if method == "one_shot":
-            episodes.append(own_episode(run, task, i))
-            continue
-        record: Callable[[Path], None] = partial(_record, run, task, method, i)
-        file = f"{settings.folder}/contexts/{task.name}-{method}-{i}.npz"
-        episode = run.once(file, read_kept_episode, record)
-        episodes.append(transform_data(as_tensordict(episode), task, run.statistics))
-    return torch.cat(episodes)
-
-
-def _record(run: Run, task: Task, method: str, index: int, path: Path) -> None:
-    """Records an episode of the member's expert that succeeds, or of another member's expert."""
-    expert = run.settings.collect.experts_of(task.name)[0]
-    seed_of = partial(run.seed, "families", method, task.name, index)
-    if method == "demonstration":
-        return keep_episode(path, record_success(task, expert, seed_of))
-    assert task.record is not None
-    seed = run.seed("families", "like", task.name, index)
-    like = others_than(run.tasks, "", seed=seed)
-    given = {"noise": expert.noise, "gains": expert.gains, "like": like, **task.options}
-    keep_episode(path, task.record(seed_of(0), **given))
-
-
-def own_episode(run: Run, task: Task, index: int) -> TensorDictBase:
-    """The policy's own first episode of a member, ``[K]``: it knows nothing of the parameter."""
-    student, metadata = run.student()
-    count = run.settings.evaluate.num_candidates
-    policy = student.policy(num_candidates=count, latent_clip=metadata["latent_clip"])
-    env = run.make_env(task, PathTaskLatent(first_latents(run, student, task, index)), num_envs=1)
-    seed = run.seed("families", "first", task.name, index)
-    played = rollout_episodes(env, policy, seed=[seed], max_steps=run.horizon(task))
-    env.close()
-    return played.reshape(-1)

@@ -41,10 +41,10 @@ def film_once(
     policy: TensorDictModuleBase,
     latent: Tensor,
     report: Report,
-) -> Film:
+) -> Film | None:
     """One episode of a member with its pictures, ``<folder>/films/<task>.json``.
 
-    Pictures are left out for environments other than the tabletop's.
+    ``None`` for environments other than the tabletop's, which make no pictures: nothing is played.
 
     Args:
         run: the run.
@@ -59,18 +59,17 @@ def film_once(
         states: list[NDArray[Any]] = []
 
         def watch(*_: object) -> None:
-            if scene is not None:
-                states.append(scene.sim.get_state().flatten())
+            states.append(scene.sim.get_state().flatten())
 
         transform = PathTaskLatent(latent.unsqueeze(0))
         with closing(make_env(task, run.statistics, transform)) as env:
-            scene = getattr(env.base_env, "robosuite_env", None)
+            scene = env.base_env.robosuite_env
             seed = run.seed("families", "film", task.name)
             horizon = run.horizon(task)
             hook = policy.register_forward_pre_hook(watch)  # before each action
             played = rollout_episodes(env, policy, seed=seed, max_steps=horizon, report=report)
             hook.remove()
-            scenes = [] if scene is None else [(scene.scene_xml(), np.stack(states)[::EVERY])]
+            scenes = [(scene.scene_xml(), np.stack(states)[::EVERY])]
         after = played["next"]
         success = after.get("success", None)
         frames = [webp(picture) for pictures in render_states(scenes) for picture in pictures]
@@ -81,9 +80,15 @@ def film_once(
             },
             episode_return=float(after["reward"].double().sum()),
             success=None if success is None else bool(success.any()),
-            period=None if scene is None else scene.control_timestep,
+            period=scene.control_timestep,
         )
         write_film(path, film)
 
     skipped = partial(report, run.horizon(task))
-    return run.once(f"{folder}/films/{task.name}.json", read_film, make, skipped=skipped)
+    file = f"{folder}/films/{task.name}.json"
+    if not (run.folder / file).exists():
+        with closing(make_env(task, run.statistics)) as env:
+            if not hasattr(env.base_env, "robosuite_env"):
+                skipped()
+                return None
+    return run.once(file, read_film, make, skipped=skipped)

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,9 +24,7 @@ from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.student import load_student
 from torchrl_bmrl.reports import Table
 from torchrl_bmrl.run.workers import Report
-
-if TYPE_CHECKING:
-    from torchrl_bmrl.studies.families import FamilySettings
+from torchrl_bmrl.studies.families_methods import FamilySettings
 
 LINES = {"m": "m", "one_hot": "one-hot code"}
 """What is mixed, and its title."""

@@ -1,0 +1,83 @@
+"""Contexts of another behaviour in a run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("hydra")
+pytest.importorskip("h5py")
+pytest.importorskip("safetensors")
+pytest.importorskip("tqdm")
+
+import tiny_family
+from tiny_family import HORIZON
+
+from torchrl_bmrl.data.robomimic import open_episodes
+from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.pipeline import Run, collect
+from torchrl_bmrl.tasks import FAMILIES
+
+
+@pytest.fixture(scope="module", autouse=True)
+def family() -> Iterator[None]:
+    tiny_family.register()
+    yield
+    del FAMILIES["walk"]
+
+
+@pytest.fixture(scope="module")
+def collected(family: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("collected")
+    with Run(tiny_family.settings(folder)) as run:
+        collect(run)
+    return folder
+
+
+def masks(path: Path) -> dict[str, int]:
+    found = {}
+    for name in ("train", "valid", "context"):
+        try:
+            with open_episodes(path, split=name, observation_keys=[]) as episodes:
+                found[name] = len(episodes)
+        except BMRLError:
+            continue
+    return found
+
+
+def test_context_episodes_are_of_other_members_experts_and_apart(collected: Path) -> None:
+    path = collected / "data" / "walk_40.hdf5"
+    assert masks(path) == {"train": 2, "valid": 1, "context": 2}
+    for split in ("train", "valid", "context"):
+        with open_episodes(path, split=split, observation_keys=[]) as episodes:
+            for _, episode in episodes.items():
+                like = str(episode.attributes.get("like", ""))
+                assert bool(like) == (split == "context")
+                assert "walk_40" not in like
+    run = Run(tiny_family.settings(collected))
+    first, second = (run.transitions("walk_40", split) for split in ("train", "context"))
+    assert len(first) == len(second) == 2 * HORIZON
+    # The data are normalised by the demonstrations alone.
+    every = torch.cat([run.transitions(name, "train")["observation"] for name in run.names])
+    torch.testing.assert_close(every.mean(0), torch.zeros(2), atol=1e-5, rtol=0)
+
+
+def test_the_number_of_context_episodes_does_not_change_the_demonstrations(
+    collected: Path, tmp_path: Path
+) -> None:
+    settings = tiny_family.settings(
+        tmp_path, {"context": "set", "inference_updates": 0, "reward_updates": 0}
+    )
+    with Run(replace(settings, collect=replace(settings.collect, context_episodes=0))) as run:
+        collect(run)
+        for name in run.names:
+            mine, theirs = (
+                Run(tiny_family.settings(x)).transitions(name, "train")
+                for x in (tmp_path, collected)
+            )
+            assert torch.equal(mine["action"], theirs["action"])
+            assert torch.equal(mine["observation"], theirs["observation"])
