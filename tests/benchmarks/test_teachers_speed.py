@@ -26,6 +26,7 @@ def test_every_variant_makes_updates(name: str) -> None:
     call()
 
 
+@pytest.mark.slow
 @needs_linux
 def test_memory_is_that_of_a_fresh_process_and_grows_with_the_agents() -> None:
     mine = bytes(range(256)) * 2_000_000  # 512 MB of this process, and not of the others
@@ -33,6 +34,7 @@ def test_memory_is_that_of_a_fresh_process_and_grows_with_the_agents() -> None:
     assert held[0] + 20 < held[1] < 200 < len(mine) / 1e6
 
 
+@pytest.mark.slow
 @needs_linux
 def test_the_script_prints_a_row_for_every_number_of_tasks(
     capsys: pytest.CaptureFixture[str],
