@@ -23,12 +23,17 @@ from torchrl_bmrl.run.command_line import exit_codes
 from torchrl_bmrl.studies.families_runs import combine
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Command line."""
+def read_options(arguments: list[str] | None = None) -> argparse.Namespace:
+    """Parses the command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("runs", nargs="+", type=Path, help="folders of runs")
     parser.add_argument("--out", type=Path, help="folder for the tables")
-    options = parser.parse_args(arguments)
+    return parser.parse_args(arguments)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Command line."""
+    options = read_options(arguments)
     with exit_codes():
         for name, table in combine(options.runs).items():
             if options.out:

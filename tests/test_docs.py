@@ -195,6 +195,9 @@ def test_every_command_of_a_recipe_gives_settings_that_it_takes(
     from torchrl_bmrl.run.settings import check_settings
 
     monkeypatch.syspath_prepend(str(ROOT / "recipes"))
+    if "@hydra.main" not in (ROOT / words[1]).read_text():  # it reads finished runs
+        importlib.import_module(recipe).read_options(words[2:])
+        return
     pytest.importorskip("robosuite", exc_type=ImportError)
     import command
 
