@@ -107,11 +107,11 @@ def test_a_student_that_goes_wrong_is_named_within_one_logging_interval(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    from torchrl_bmrl.pipeline import stage2
+    from torchrl_bmrl.pipeline import stage2, training
 
     module: Any = sys.modules[stage2.__module__]  # the package's function hides its name
     shutil.copytree(finished / "bcq", collected_run / "bcq")
-    step, calls, students = module.gradient_step, [], []
+    step, calls, students = training.gradient_step, [], []
     make = module.Student
 
     def watched(**options: Any) -> Any:
@@ -133,7 +133,7 @@ def test_a_student_that_goes_wrong_is_named_within_one_logging_interval(
                     layers[4].bias.fill_(50.0)
 
     monkeypatch.setattr(module, "Student", watched)
-    monkeypatch.setattr(module, "gradient_step", breaking)
+    monkeypatch.setattr(training, "gradient_step", breaking)
     assert exit_code(run, collected_run, stage2) == 1
     said = capsys.readouterr().err
     assert re.search(rf"error: distillation, update 8: {says}", said), said

@@ -151,6 +151,7 @@ def still_playing(data: TensorDictBase) -> Tensor:
             episode before the others end is filled up.
 
     Example:
+        >>> from tensordict import TensorDict
         >>> done = torch.tensor([False, True, True]).unsqueeze(-1)
         >>> still_playing(TensorDict({"next": {"done": done}}, [3]))
         tensor([ True,  True, False])

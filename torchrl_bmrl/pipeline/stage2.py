@@ -227,7 +227,8 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
         report(done)
     end = distill.updates + distill.inference_updates
     if done == end:
-        report(distill.reward_updates)
+        if distill.reward_updates:
+            report(distill.reward_updates)
         return
     accelerated = accelerate(
         make_update(loss, optimizers["student"]),
