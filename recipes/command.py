@@ -164,7 +164,8 @@ def _given(config: DictConfig) -> Mapping[str, Any]:
     """Returns the settings of the command line, by dotted names; none outside of Hydra."""
     if not HydraConfig.initialized():
         return {}
-    lines = list(HydraConfig.get().overrides.task)
+    # References stay, as in the configuration below.
+    lines: Any = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
     overrides = OverridesParser.create().parse_overrides(lines)
     given = dict(flat({override.key_or_group: override.value() for override in overrides}))
     # Hydra still has the overrides of its last command if this configuration is made in code.

@@ -189,6 +189,12 @@ def test_every_job_that_fails_is_named_and_the_others_are_done(
 
 
 @pytest.mark.slow
+def test_every_job_of_a_sweep_resolves_references_itself(tmp_path: Path) -> None:
+    code, said, files = sweep(tmp_path, "seed=0,2", "run_dir=y${seed}")
+    assert (code, files) == (0, {"y0-0", "y2-2"}), said
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["joblib", "ray"])
 def test_jobs_that_failed_are_named_though_another_ones_process_was_killed(
     tmp_path: Path, launcher: str

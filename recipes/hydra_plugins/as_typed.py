@@ -25,7 +25,7 @@ class AsTyped(Callback):
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Corrects the configuration of a single run."""
         parser = OverridesParser.create()
-        for line in list(config.hydra.overrides.task):
+        for line in task_overrides(config):
             if (typed := as_typed(line, config)) != line:
                 override = parser.parse_override(typed)
                 OmegaConf.update(config, override.key_or_group, override.value())
@@ -34,8 +34,14 @@ class AsTyped(Callback):
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Corrects the overrides of a sweep."""
         with open_dict(config.hydra):
-            lines = [as_typed(line, config) for line in config.hydra.overrides.task]
+            lines = [as_typed(line, config) for line in task_overrides(config)]
             config.hydra.overrides.task = lines
+
+
+def task_overrides(config: DictConfig) -> list[str]:
+    """Returns the overrides as typed: each job of a sweep resolves its references itself."""
+    lines: Any = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
+    return lines
 
 
 def as_typed(line: str, config: DictConfig) -> str:
