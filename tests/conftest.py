@@ -67,6 +67,18 @@ def minari_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "minari"
 
 
+@pytest.fixture(scope="module")
+def walk_family() -> Iterator[None]:
+    """The family of ``tiny_family.py`` is registered."""
+    import tiny_family
+
+    from torchrl_bmrl.tasks import FAMILIES
+
+    tiny_family.register()
+    yield
+    del FAMILIES[tiny_family.FAMILY.name]
+
+
 @pytest.fixture(scope="session")
 def recipes() -> Iterator[Any]:
     """Module ``command`` of the recipes, which are importable as for a script beside them."""

@@ -14,21 +14,25 @@ from tiny_family import FAMILY, make_walk
 
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.experts.collect import WANDERING, collect_demonstrations, others_than
-from torchrl_bmrl.tasks import get_task
+from torchrl_bmrl.tasks import Task, get_task
+
+
+def collect_one_of_each(folder: Path, *tasks: Task) -> None:
+    collect_demonstrations(
+        folder,
+        tasks,
+        {task.name: 1 for task in tasks},
+        valid_episodes=1,
+        context_episodes=1,
+        noise=0.0,
+        seed=0,
+        workers=1,
+    )
 
 
 def test_one_task_has_no_other_behaviour(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"context_episodes with one task; valid: .*two tasks"):
-        collect_demonstrations(
-            tmp_path,
-            [make_walk(0.0)],
-            {"walk_0": 1},
-            valid_episodes=1,
-            context_episodes=1,
-            noise=0.0,
-            seed=0,
-            workers=1,
-        )
+        collect_one_of_each(tmp_path, make_walk(0.0))
     assert not list(tmp_path.iterdir())
 
 
@@ -41,16 +45,7 @@ def test_an_expert_that_cannot_act_in_other_tasks_is_refused_before_anything_is_
 ) -> None:
     alone = replace(make_walk(0.0), record=record_alone)
     with pytest.raises(ConfigError, match=r"task walk_0 has a record without like.*valid: 0, or"):
-        collect_demonstrations(
-            tmp_path,
-            [alone, make_walk(90.0)],
-            {"walk_0": 1, "walk_90": 1},
-            valid_episodes=1,
-            context_episodes=1,
-            noise=0.0,
-            seed=0,
-            workers=1,
-        )
+        collect_one_of_each(tmp_path, alone, make_walk(90.0))
     assert not list(tmp_path.iterdir())
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -37,22 +36,17 @@ from torchrl_bmrl.studies.families_peers import (
     peer_data,
     train_peer,
 )
-from torchrl_bmrl.tasks import FAMILIES
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 STUDY = tiny_family.study(methods=["focal", "focal_one_shot", "mbml", "mbml_one_shot"])
 CHECKPOINTS = ("families/*/checkpoint.safetensors", "families/*/*/checkpoint.safetensors")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def family() -> Iterator[None]:
-    tiny_family.register()
-    yield
-    del FAMILIES["walk"]
+pytestmark = pytest.mark.usefixtures("walk_family")
 
 
 @pytest.fixture(scope="module")
-def trained(family: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(walk_family: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with agents, a student and both peers. Tests only read it."""
     folder = tmp_path_factory.mktemp("trained")
     with Run(tiny_family.settings(folder)) as run:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import shutil
-from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -35,22 +34,17 @@ from torchrl_bmrl.pipeline.student import load_student
 from torchrl_bmrl.studies import families, families_methods
 from torchrl_bmrl.studies.families import generalise
 from torchrl_bmrl.studies.families_methods import METHODS, OWN, make_method
-from torchrl_bmrl.tasks import FAMILIES
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 STUDY = tiny_family.study()
 HELD_OUT = ("walk_60", "walk_150")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def family() -> Iterator[None]:
-    tiny_family.register()
-    yield
-    del FAMILIES["walk"]
+pytestmark = pytest.mark.usefixtures("walk_family")
 
 
 @pytest.fixture(scope="module")
-def trained(family: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(walk_family: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of both stages, evaluated. Tests only read it."""
     folder = tmp_path_factory.mktemp("trained")
     sources = ["prototype", "online", "demonstration"]
@@ -118,18 +112,19 @@ def test_a_row_has_the_return_of_the_demonstration_that_the_policy_is_given(
     assert families.data_return(run, STUDY, without, 0) == ""
 
 
-def test_a_study_of_an_earlier_version_gets_the_new_columns_without_playing(
-    folder: Path, studied: tuple[Path, str], monkeypatch: pytest.MonkeyPatch
+def test_a_method_s_file_of_an_earlier_version_is_refused_by_name(
+    folder: Path, studied: tuple[Path, str]
 ) -> None:
     shutil.rmtree(folder)
     shutil.copytree(studied[0], folder)
-    path = folder / "families" / "results.csv"
-    now, kept = path.read_text(), ("method", "split", "member", "episode", "return", "success")
+    path = folder / "families" / "told" / "walk_60.csv"
+    kept = ("method", "split", "member", "episode", "return", "success")
     write_rows(path, [{key: row[key] for key in kept} for row in rows(path)])
-    monkeypatch.setattr(families, "_play", pytest.fail)
-    with Run(configured(folder)) as run:
+    with (
+        Run(configured(folder)) as run,
+        pytest.raises(BMRLError, match=r"told/walk_60\.csv.*family"),
+    ):
         generalise(run, STUDY)
-    assert path.read_text() == now
 
 
 def test_the_line_between_members_is_measured(studied: tuple[Path, str]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,18 +19,12 @@ from tiny_family import HORIZON
 from torchrl_bmrl.data.robomimic import open_episodes
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.pipeline import Run, collect
-from torchrl_bmrl.tasks import FAMILIES
 
-
-@pytest.fixture(scope="module", autouse=True)
-def family() -> Iterator[None]:
-    tiny_family.register()
-    yield
-    del FAMILIES["walk"]
+pytestmark = pytest.mark.usefixtures("walk_family")
 
 
 @pytest.fixture(scope="module")
-def collected(family: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def collected(walk_family: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("collected")
     with Run(tiny_family.settings(folder)) as run:
         collect(run)

@@ -268,6 +268,11 @@ def finite(text: str) -> float:
     raise ValueError("a finite number")
 
 
+def or_nothing(text: str) -> float | str:
+    """Parses a finite number or an empty text, or raises ``ValueError``."""
+    return finite(text) if text else ""
+
+
 def one_of(*valid: str) -> Callable[[str], str]:
     """Returns a parser that accepts these texts only."""
 

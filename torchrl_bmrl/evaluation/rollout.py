@@ -137,7 +137,11 @@ def evaluate_policy(
         successes: list[bool | None] = [None] * len(part)
         if (success := after.get("success", None)) is not None:
             successes = (success.reshape(len(part), -1) & playing).any(-1).tolist()
-        stages = after.get("stage", playing.long() * 0).reshape(len(part), -1).amax(-1)
+        stages = (
+            after.get("stage", torch.zeros_like(playing, dtype=torch.int64))
+            .reshape(len(part), -1)
+            .amax(-1)
+        )
         rows = zip(returns, successes, stages.tolist(), strict=True)
         outcomes += [EpisodeOutcome(*row) for row in rows]
     return outcomes

@@ -15,7 +15,7 @@ from typing import Any
 
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.families import SPLITS
-from torchrl_bmrl.files import number, read_rows, whole, write_rows
+from torchrl_bmrl.files import number, or_nothing, read_rows, whole, write_rows
 from torchrl_bmrl.modules import embed_context, reads_context
 from torchrl_bmrl.modules.task_latent import check_reads_transitions
 from torchrl_bmrl.pipeline.run import Run
@@ -43,11 +43,18 @@ from torchrl_bmrl.tasks import Task
 
 HELD_OUT = SPLITS[1:]
 _COLUMNS: dict[str, Any] = {
-    **dict.fromkeys(("method", "split", "member"), str),
+    **dict.fromkeys(("family", "method", "split", "member"), str),
     "episode": whole,
     "return": number,
     "success": str,
+    "data_return": or_nothing,
 }
+HEADINGS = {
+    "": "Tasks that nobody trained on",
+    "_shares": "Shares of the return of others",
+    "_differences": "What m is worth",
+}
+"""Headings of the tables of :func:`.make_tables` on the page."""
 _OTHERS: dict[str, str] = {"told": "told", "one_hot": "one_hot", "no_context": "nothing"}
 """Encoders of the students that are trained for the comparison, by method."""
 
@@ -113,7 +120,7 @@ def generalise(run: Run, settings: FamilySettings) -> str:
     explorer = explore(run, settings, members) if "demonstration" in methods else None
     for end, table in tables.items():
         section = Section(
-            heading="Tasks that nobody trained on",
+            heading=HEADINGS[end],
             tables=[table],
             explorer=None if end else explorer,
         )
@@ -229,19 +236,17 @@ Job = tuple[FamilySettings, str, Task]
 def play_member(job: tuple[Run, Job], report: Report) -> list[dict[str, Any]]:
     """Episodes of a held-out member with every method, played once."""
     run, (settings, split, task) = job
+    returns = [data_return(run, settings, task, i) for i in range(settings.episodes)]
     rows = []
     for method in settings.methods:
         steps = settings.episodes * run.horizon(task)
         rows += run.once(
             f"{settings.folder}/{method}/{task.name}.csv",
             partial(read_rows, columns=_COLUMNS),
-            partial(_play, run, settings, split, task, method, report),
+            partial(_play, run, settings, split, task, method, returns, report),
             skipped=partial(report, steps),
         )
-    # Not in the files of the methods, so that studies of earlier versions get these columns, too.
-    returns = [data_return(run, settings, task, i) for i in range(settings.episodes)]
-    family = run.family.name
-    return [row | {"family": family, "data_return": returns[row["episode"]]} for row in rows]
+    return rows
 
 
 def data_return(run: Run, settings: FamilySettings, task: Task, index: int) -> float | str:
@@ -265,20 +270,22 @@ def _play(
     split: str,
     task: Task,
     method: str,
+    returns: Sequence[float | str],
     report: Report,
     path: Path,
 ) -> None:
     seeds = [run.seed("families", task.name, i) for i in range(settings.episodes)]
     policy, source = make_method(run, settings, task, method)
     outcomes = run.play(task, policy, source, seeds=seeds, report=report)
-    first = {"method": method, "split": split, "member": task.name}
+    first = {"family": run.family.name, "method": method, "split": split, "member": task.name}
     rows = [
         {
             **first,
             "episode": i,
             "return": outcome.episode_return,
             "success": "" if outcome.success is None else int(outcome.success),
+            "data_return": data,
         }
-        for i, outcome in enumerate(outcomes)
+        for i, (outcome, data) in enumerate(zip(outcomes, returns, strict=True))
     ]
     write_rows(path, rows)

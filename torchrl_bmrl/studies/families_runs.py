@@ -11,7 +11,7 @@ from typing import Any
 from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.evaluation.results import name
 from torchrl_bmrl.families import SPLITS, registered_families
-from torchrl_bmrl.files import finite, one_of, read_rows, whole
+from torchrl_bmrl.files import finite, one_of, or_nothing, read_rows, whole
 from torchrl_bmrl.pipeline.settings import Settings
 from torchrl_bmrl.reports import Table
 from torchrl_bmrl.run.folder import deciding, read_settings
@@ -21,11 +21,6 @@ from torchrl_bmrl.studies.families_line import line_table
 from torchrl_bmrl.studies.families_report import make_tables
 from torchrl_bmrl.tasks import FAMILIES
 
-
-def _or_nothing(text: str) -> float | str:
-    return finite(text) if text else ""
-
-
 _COLUMNS: dict[str, Any] = {
     "family": name,
     "method": one_of(*METHODS),
@@ -34,7 +29,7 @@ _COLUMNS: dict[str, Any] = {
     "episode": whole,
     "return": finite,
     "success": one_of("", "0", "1"),
-    "data_return": _or_nothing,
+    "data_return": or_nothing,
 }
 
 
