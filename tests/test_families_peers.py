@@ -224,3 +224,10 @@ def test_a_checkpoint_of_another_kind_is_no_focal(trained: Path) -> None:
 
 def test_the_weights_of_the_terms_are_those_of_the_settings() -> None:
     assert MBMLSettings().triplet_weight == 0.1
+
+
+def test_tasks_of_no_family_are_refused(tmp_path: Path) -> None:
+    settings = replace(tiny_family.settings(tmp_path), tasks=["walk_0", "walk_40"])
+    with Run(settings) as run, pytest.raises(ConfigError, match="valid: the trained members of"):
+        generalise(run, STUDY)
+    assert not (tmp_path / "families").exists()

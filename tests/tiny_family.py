@@ -141,7 +141,7 @@ def settings(folder: Path, distill: dict[str, Any] | None = None, **changes: Any
     """Settings of the smallest run whose student reads sets of transitions."""
     small = {
         "updates": 4,
-        "inference_updates": 2,
+        "inference_updates": 4,
         "reward_updates": 3,
         "batch_size": 8,
         "num_cells": [16],
