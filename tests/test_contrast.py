@@ -88,6 +88,14 @@ def test_infonce_does_not_depend_on_the_order_of_the_tasks() -> None:
     )
 
 
+def test_infonce_recognises_a_task_among_those_that_are_compared() -> None:
+    a, near = points(0), points(1)
+    found = contrastive_error(a, near, 0.1, torch.tensor([True, False, True]))
+    kept = [0, 2]
+    torch.testing.assert_close(found[kept], contrastive_error(a[kept], near[kept], 0.1))
+    assert found[1].isfinite().all()
+
+
 def test_infonce_is_finite_at_zero_and_for_a_small_temperature() -> None:
     a = torch.zeros(SHAPE, requires_grad=True)
     contrastive_error(a, a, 0.1).sum().backward()

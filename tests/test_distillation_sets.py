@@ -29,6 +29,7 @@ from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.functional import triplet_error
 from torchrl_bmrl.modules import as_context, make_context_encoder, make_told_encoder
 from torchrl_bmrl.objectives import MetaDistillationLoss
+from torchrl_bmrl.objectives.student_terms import arranging_errors
 
 GIVEN = {"context": "given"}
 each_context = pytest.mark.parametrize("context", ["set", "given"])
@@ -287,6 +288,17 @@ def test_padding_changes_no_loss_whatever_it_holds(context: str, number: int) ->
             torch.testing.assert_close(found, expected)
 
 
+def test_a_task_of_padding_alone_moves_m_of_no_other_task() -> None:
+    valid = torch.ones(TASKS, ROWS, dtype=torch.bool)
+    valid[1], points, found = False, torch.randn(TASKS, ROWS, 2), []
+    for _ in range(2):
+        torch.manual_seed(0)
+        errors = arranging_errors(make_loss(**ARRANGING), points, valid, valid.shape)
+        found.append(torch.stack([error[0] for error in errors.values()]))
+        points[1] += torch.randn(2)
+    assert torch.equal(*found)
+
+
 def test_m_of_a_row_that_counts_is_never_that_of_padding() -> None:
     mask = torch.zeros(TASKS, ROWS, dtype=torch.bool)
     mask[:, :3] = True
@@ -302,8 +314,7 @@ def test_m_of_a_row_that_counts_is_never_that_of_padding() -> None:
 
 def test_a_mask_of_all_rows_gives_finite_losses_as_none_does() -> None:
     data = padded(batch(), torch.ones(TASKS, ROWS, dtype=torch.bool), 0.0)
-    losses = make_loss(**ARRANGING)(data)
-    assert losses.isfinite().all()
+    assert make_loss(**ARRANGING)(data).isfinite().all()
     empty = padded(batch(), torch.zeros(TASKS, ROWS, dtype=torch.bool), float("nan"))
     assert make_loss(**ARRANGING)(empty).isfinite().all()
 

@@ -14,6 +14,7 @@ from torchrl_bmrl import modules
 from torchrl_bmrl.behaviour import dual_kl, squashed_gaussian
 from torchrl_bmrl.modules import embed_context, extract_network
 from torchrl_bmrl.objectives import FOCALLoss
+from torchrl_bmrl.objectives.contexts import Embedded
 
 pytestmark = pytest.mark.filterwarnings(NO_UPDATER)
 
@@ -114,6 +115,41 @@ def test_a_row_is_never_in_its_own_context() -> None:
         data["observation"][:, number] = 5.0
         torch.manual_seed(0)
         assert torch.equal(loss.embed(data)[0][:, number], before[:, number])
+
+
+@pytest.mark.parametrize("last", [1, 6])
+def test_padding_changes_no_loss_whatever_it_holds(last: int) -> None:
+    losses = []
+    for value in (0.0, 0.5, float("nan")):
+        loss, data = make_focal_loss(context_size=2), task_data(3, 6)
+        mask = torch.ones(3, 6, 1, dtype=torch.bool)
+        mask[0, :last] = False
+        for key, found in list(data.items(True, True)):
+            if found.is_floating_point():
+                data[key] = torch.where(mask, found, value)
+        data["collector", "mask"] = mask
+        torch.manual_seed(0)
+        losses.append(loss(data))
+        assert losses[-1].isfinite().all()
+    for other in losses[1:]:
+        for key, found in other.items():
+            torch.testing.assert_close(found, losses[0][key], msg=key)
+
+
+def test_a_task_of_padding_alone_moves_the_encoder_of_no_other_task() -> None:
+    loss, data = make_focal_loss(), task_data(4, 6)
+    mask = torch.ones(4, 6, 1, dtype=torch.bool)
+    mask[2] = False
+    data["collector", "mask"] = mask
+    points = torch.randn(4, 3, 2, dtype=torch.float64)
+    valid = mask[:, :3, 0]
+    found = []
+    for _ in range(2):
+        loss.embed = lambda _: Embedded(points, points, valid)  # type: ignore[method-assign]
+        torch.manual_seed(0)
+        found.append(loss.encoder_loss(data)[0])
+        points[2] += 1.0
+    assert torch.equal(*found)
 
 
 def test_padded_rows_have_no_priority() -> None:

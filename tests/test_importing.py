@@ -229,7 +229,40 @@ def test_other_masks_of_the_source_stay(tmp_path: Path) -> None:
     assert masks(tmp_path / "lift.hdf5")["better"] == ["demo_0", "demo_2"]
 
 
+def test_episodes_of_another_behaviour_are_neither_trained_on_nor_held_out(tmp_path: Path) -> None:
+    episodes, others = [make_episode(seed=i) for i in range(8)], {"context": [1, 4, 7]}
+    robomimic.write_episodes(tmp_path / "own.hdf5", episodes, env_args=ENV_ARGS, masks=others)
+    import_demonstrations(
+        tmp_path / "own.hdf5", tmp_path / "lift.hdf5", valid_share=0.4, context=True
+    )
+    assert masks(tmp_path / "lift.hdf5") == {
+        "train": ["demo_0", "demo_3", "demo_6"],
+        "valid": ["demo_2", "demo_5"],
+        "context": ["demo_1", "demo_4", "demo_7"],
+    }
+
+
 # -- what is refused, and what is said -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stated", [{}, {"context": []}, {"train": [0], "valid": [1]}])
+def test_missing_episodes_of_another_behaviour_are_refused_before_anything_is_written(
+    tmp_path: Path, stated: dict[str, list[int]]
+) -> None:
+    episodes = [make_episode(seed=i) for i in range(2)]
+    robomimic.write_episodes(tmp_path / "own.hdf5", episodes, env_args=ENV_ARGS, masks=stated)
+    with pytest.raises(DataError, match=r"own.hdf5.*mask/context.*names no episode; valid"):
+        import_demonstrations(tmp_path / "own.hdf5", tmp_path / "lift.hdf5", context=True)
+    assert not (tmp_path / "lift.hdf5").exists()
+
+
+def test_too_few_episodes_beside_those_of_another_behaviour_are_refused(tmp_path: Path) -> None:
+    episodes = [make_episode(seed=i) for i in range(3)]
+    robomimic.write_episodes(
+        tmp_path / "own.hdf5", episodes, env_args=ENV_ARGS, masks={"context": [0, 1]}
+    )
+    with pytest.raises(DataError, match="1 episodes outside mask/context; valid: at least two"):
+        import_demonstrations(tmp_path / "own.hdf5", tmp_path / "lift.hdf5")
 
 
 def test_a_single_episode_is_refused(tmp_path: Path) -> None:

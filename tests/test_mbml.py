@@ -109,6 +109,21 @@ def test_padded_transitions_are_not_relabelled() -> None:
     assert relabelled["observation"][relabelled["mask"]].any(-1).all()  # padding is zeros
 
 
+def test_a_context_without_a_row_that_counts_is_in_no_triplet() -> None:
+    loss, data = make_mbml_loss(context_size=2), task_transitions(3, 6)
+    mask = torch.ones(3, 6, 1, dtype=torch.bool)
+    mask[1, 1:] = False  # of the three contexts of this task, one has a row
+    data["collector", "mask"] = mask
+    found = []
+    for far in (0.0, 1e6):
+        points = torch.zeros(3, 9, 2, dtype=torch.float64)  # anchors, positive and negative ones
+        points[1, 4:6] = far
+        loss._points = lambda *_, points=points: points  # type: ignore[method-assign]
+        torch.manual_seed(0)
+        found.append(loss._triplet_error(data))
+    assert torch.equal(*found)
+
+
 def test_reward_models_are_frozen_copies() -> None:
     loss = make_mbml_loss()
     losses = loss(task_transitions(3, 5))

@@ -202,6 +202,7 @@ def test_a_figure_without_data_is_left_out_and_the_page_says_so(tmp_path: Path) 
     text = write_report(tmp_path, default_source="prototype", facts={}).read_text(encoding="utf-8")
     assert not (tmp_path / "figures").exists()
     assert "training curves is left out" in text
+    assert text.count("are left out") == 1
     assert "figures of the embedding are left out" in text
     write_curves(tmp_path, "lift", [(1, 50, 0, 10.0, 0)])
     text = write_report(tmp_path, default_source="prototype", facts={}).read_text(encoding="utf-8")

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchrl_bmrl.objectives.task_rows import draw_others, draw_rows
+from torchrl_bmrl.objectives.task_rows import draw_others, draw_pairs, draw_rows, other_tasks
 
 TASKS, ROWS = 3, 4
 VALID = torch.tensor([[True, False, True, True], [False, True, False, True], [True] * 4])
@@ -61,3 +61,30 @@ def test_rows_that_a_mask_leaves_out_are_never_drawn_and_all_others_are() -> Non
         expected = {tuple(each) for each in m[task][VALID[task]].tolist()}
         for drawn in (near[:, task], several[:, task]):
             assert {tuple(each) for each in drawn.flatten(0, -2).tolist()} == expected
+
+
+@pytest.mark.parametrize("empty", [0, 1, 2])
+def test_a_task_of_padding_alone_is_no_other_task_of_any(empty: int) -> None:
+    m, valid = named_rows(), VALID.clone()
+    valid[empty] = False
+    _, far = repeated(lambda: draw_others(m, valid))
+    for task in {0, 1, 2} - {empty}:
+        (other,) = {0, 1, 2} - {empty, task}
+        drawn = {tuple(each) for each in far[:, task].flatten(0, 1).tolist()}
+        assert drawn == {tuple(each) for each in m[other][valid[other]].tolist()}
+
+
+@pytest.mark.parametrize("valid", [None, VALID], ids=["all", "masked"])
+def test_each_other_task_has_one_of_its_rows_in_turn(valid: Tensor | None) -> None:
+    m = named_rows()
+    near, far = repeated(lambda: draw_pairs(m, valid))
+    counts = torch.ones(TASKS, ROWS, dtype=torch.bool) if valid is None else valid
+    others = other_tasks(TASKS, m.device)
+    assert others.tolist() == [[1, 2], [2, 0], [0, 1]]
+    for task in range(TASKS):
+        own = {tuple(each) for each in near[:, task].flatten(0, 1).tolist()}
+        assert own == {tuple(each) for each in m[task][counts[task]].tolist()}
+        for turn, other in enumerate(others[task]):
+            drawn = {tuple(each) for each in far[:, task, :, turn].flatten(0, 1).tolist()}
+            assert drawn == {tuple(each) for each in m[other][counts[other]].tolist()}
+    assert (near != m)[:, counts].any(-1).all()

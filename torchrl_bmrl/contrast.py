@@ -38,7 +38,9 @@ def distance_error(
     return near + 1 / (apart.clamp(min=1e-12) ** (power / 2) + epsilon)
 
 
-def contrastive_error(anchor: Tensor, positive: Tensor, temperature: float) -> Tensor:
+def contrastive_error(
+    anchor: Tensor, positive: Tensor, temperature: float, compared: Tensor | None = None
+) -> Tensor:
     r"""InfoNCE: how surely the other embedding of each task is recognised among those of all tasks.
 
     .. math:: -\log \frac{\exp(\cos(m_i, m_i^+) / \tau)}{\sum_j \exp(\cos(m_i, m_j^+) / \tau)}
@@ -52,6 +54,7 @@ def contrastive_error(anchor: Tensor, positive: Tensor, temperature: float) -> T
         anchor: m, ``(num_tasks, B, d)``.
         positive: another embedding of the row's task, likewise.
         temperature: τ.
+        compared: which tasks the others are recognised among, ``(num_tasks,)``; ``None`` if all.
 
     Returns:
         ``(num_tasks, B)``.
@@ -64,4 +67,7 @@ def contrastive_error(anchor: Tensor, positive: Tensor, temperature: float) -> T
     anchor, positive = F.normalize(anchor, dim=-1), F.normalize(positive, dim=-1)
     logits = torch.einsum("ibd,jbd->ibj", anchor, positive) / temperature
     own = logits.diagonal(dim1=0, dim2=2).transpose(0, 1)
+    if compared is not None:  # a task's own embedding stays, so that the error is finite
+        itself = torch.eye(len(logits), dtype=torch.bool, device=logits.device)
+        logits = logits.masked_fill(~(compared | itself).unsqueeze(1), -torch.inf)
     return logits.logsumexp(-1) - own

@@ -15,7 +15,7 @@ from torchrl_bmrl.data import robomimic
 from torchrl_bmrl.data.convert import Conversion, Stream, writing
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.options import Bounds, ReadOptions, check_bounds, join_bounds
-from torchrl_bmrl.data.robomimic_file import MASKS
+from torchrl_bmrl.data.robomimic_file import CONTEXT_MASK, MASKS
 from torchrl_bmrl.data.sources import (
     Source,
     open_sources,
@@ -40,15 +40,17 @@ def import_demonstrations(
     task: str | None = None,
     tracking: float = 1.0,
     valid_share: float = 0.1,
+    context: bool = False,
     bounds: Bounds | None = None,
     report: Callable[[int], object] = lambda _: None,
 ) -> Conversion:
     """Writes a user's demonstrations into one file in robomimic's layout, ready for training.
 
     Actions are scaled to [-1, 1]. Two masks tell the episodes to train on (``train``) from those
-    that are held out (``valid``): the sources' own, if every source has both, else every k-th
-    episode is held out. Observations, rewards, terminations, successes, other arrays and attributes
-    are copied. Notes on what was changed or left out are logged.
+    that are held out (``valid``): the sources' own, if every source has both. Otherwise, every k-th
+    episode is held out, of those outside a mask ``context`` of another behaviour's episodes.
+    Observations, rewards, terminations, successes, other arrays and attributes are copied. Notes on
+    what was changed or left out are logged.
 
     Args:
         source: a file or data set folder of any format that
@@ -59,6 +61,7 @@ def import_demonstrations(
         task: the task in whose scene a robosuite ``demo.hdf5`` was recorded.
         tracking: see :func:`torchrl_bmrl.data.robosuite.open_episodes`.
         valid_share: share of the episodes to hold out, of which there is at least one.
+        context: whether every source needs a mask ``context``.
         bounds: lowest and highest action, which become -1 and 1; those of
             :func:`find_action_bounds` if ``None``. The file stores them, see
             :func:`read_original_bounds`.
@@ -70,8 +73,8 @@ def import_demonstrations(
     Raises:
         ConfigError: for invalid options.
         DataError: naming file, key and row for data that cannot be trained on, for discrete
-            actions, missing rewards, a single episode, and for a target that exists or cannot be
-            written.
+            actions, missing rewards or masks, a single episode, and for a target that exists or
+            cannot be written.
 
     Example:
         >>> import tempfile
@@ -108,9 +111,10 @@ def import_demonstrations(
         _check_actions(sources)
         bounds = chosen or _bounds_of(sources)
         stream = Stream(with_bounds(sources, bounds), report)
-        if len(stream.names) < 2:
-            message = "one episode; valid: at least two, one to train on and one to hold out"
-            raise DataError(sources[0].path, None, message)
+        for opened in stream.sources if context else ():
+            if not opened.metadata.get("masks", {}).get(CONTEXT_MASK):
+                message = "names no episode; valid: the episodes of another behaviour"
+                raise DataError(opened.path, f"mask/{CONTEXT_MASK}", message)
         masks, how = _masks(stream, valid_share)
         original = _original_bounds(stream, bounds)
         with writing(target):
@@ -284,9 +288,14 @@ def _masks(stream: Stream, valid_share: float) -> tuple[dict[str, Sequence[int]]
     stated = all(set(MASKS) <= set(source.metadata.get("masks", {})) for source in stream.sources)
     if stated and masks["train"] and masks["valid"]:
         return masks, "by the masks of the source"
-    count = len(stream.names)
-    held_out = min(count - 1, max(1, round(valid_share * count)))
-    step = count // held_out
-    valid = range(step - 1, count, step)[:held_out]
-    train = [i for i in range(count) if i not in valid]
+    others = set(masks.get(CONTEXT_MASK, ()))
+    own = [i for i in range(len(stream.names)) if i not in others]
+    if len(own) < 2:
+        found = f"{len(own)} episodes outside mask/{CONTEXT_MASK}" if others else "one episode"
+        message = f"{found}; valid: at least two, one to train on and one to hold out"
+        raise DataError(stream.sources[0].path, None, message)
+    held_out = min(len(own) - 1, max(1, round(valid_share * len(own))))
+    step = len(own) // held_out
+    valid = own[step - 1 :: step][:held_out]
+    train = [i for i in own if i not in set(valid)]
     return masks | {"train": train, "valid": valid}, f"one in every {step}"

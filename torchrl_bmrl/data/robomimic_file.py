@@ -26,6 +26,8 @@ with needs("data"):
     import h5py
 
 MASKS = ("train", "valid")
+CONTEXT_MASK = "context"
+"""Of episodes of another behaviour."""
 
 
 def episode_names(path: str | Path, file: h5py.File, split: str | None = None) -> list[str]:

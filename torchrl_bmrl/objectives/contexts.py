@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_bmrl.context_keys import CONTEXT
 from torchrl_bmrl.errors import BMRLError
+
+
+class Embedded(NamedTuple):
+    """m of a batch."""
+
+    latent: Tensor  # of each row, (num_tasks, B, m)
+    points: Tensor  # that the arranging terms compare: of the rows, or of the sets, likewise
+    valid: Tensor | None  # which of the points count
 
 
 def group_rows(
@@ -91,13 +101,13 @@ def assign(points: Tensor, own: Tensor, filled: Tensor | None, *, apart: bool) -
     return points.gather(1, chosen.unsqueeze(-1).expand(num_tasks, -1, size))
 
 
-def which_count(points: Tensor, filled: Tensor | None) -> Tensor | None:
-    """Which contexts have a row that counts, ``(num_tasks, C)``; ``None`` if all do.
+def which_count(count: int, filled: Tensor | None) -> Tensor | None:
+    """Which contexts have a row that counts, ``(num_tasks, count)``; ``None`` if all do.
 
     Args:
-        points: embeddings of the contexts, ``(num_tasks, C, m)``.
+        count: number of contexts of each task.
         filled: as of :func:`group_rows`.
     """
     if filled is None:
         return None
-    return torch.arange(points.shape[1], device=points.device) < filled.unsqueeze(-1)
+    return torch.arange(count, device=filled.device) < filled.unsqueeze(-1)

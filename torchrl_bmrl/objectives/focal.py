@@ -21,11 +21,11 @@ from torchrl_bmrl.generators import written
 from torchrl_bmrl.objectives.checks import check_network, check_number
 from torchrl_bmrl.objectives.common import OfflineLoss
 from torchrl_bmrl.objectives.context_rows import context_keys, encode_contexts
-from torchrl_bmrl.objectives.contexts import assign, group_rows
+from torchrl_bmrl.objectives.contexts import Embedded, assign, group_rows, which_count
 from torchrl_bmrl.objectives.data import check_within, entry, next_key
 from torchrl_bmrl.objectives.estimators import outcomes
 from torchrl_bmrl.objectives.generative import action_bounds, register_bounds
-from torchrl_bmrl.objectives.task_rows import draw_pairs
+from torchrl_bmrl.objectives.task_rows import draw_pairs, other_tasks
 
 
 class FOCALLoss(OfflineLoss):
@@ -228,14 +228,15 @@ class FOCALLoss(OfflineLoss):
 
     # -- the embedding ---------------------------------------------------------------------------
 
-    def embed(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def embed(self, tensordict: TensorDictBase) -> Embedded:
         """m of another context of each row's task, and m of all contexts.
 
         Args:
             tensordict: the data, ``[num_tasks, B]``.
 
         Returns:
-            ``(num_tasks, B, m)`` and ``(num_tasks, C, m)``.
+            ``(num_tasks, B, m)``, ``(num_tasks, C, m)``, and which of the contexts count,
+            ``(num_tasks, C)``, ``None`` for all.
 
         Raises:
             BMRLError: for data of less than two tasks or two contexts, or that do not fit.
@@ -250,7 +251,8 @@ class FOCALLoss(OfflineLoss):
         rows = self.rows(tensordict, context_keys(self.task_encoder))
         contexts, own, filled = group_rows(rows, self.context_size, valid)
         points = encode_contexts(self, contexts, rows)
-        return assign(points, own, filled, apart=True), points
+        latent = assign(points, own, filled, apart=True)
+        return Embedded(latent, points, which_count(points.shape[1], filled))
 
     @torch.no_grad()
     def _with_latent(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
@@ -261,7 +263,7 @@ class FOCALLoss(OfflineLoss):
         valid = self.valid_rows(tensordict, action.shape[:-1])
         check_within(key, action, self.action_low, self.action_high, valid)
         data = self.rows(tensordict, [*self.observation_keys, key]).copy()
-        return data.set(self.tensor_keys.task_latent, self.embed(tensordict)[0]), action
+        return data.set(self.tensor_keys.task_latent, self.embed(tensordict).latent), action
 
     # -- losses, in update order -----------------------------------------------------------------
 
@@ -271,9 +273,15 @@ class FOCALLoss(OfflineLoss):
         Returns:
             the loss, and no metrics.
         """
-        _, points = self.embed(tensordict)
-        near, far = draw_pairs(points)
-        error = distance_error(points.unsqueeze(2), near.unsqueeze(2), far).mean((1, 2))
+        _, points, valid = self.embed(tensordict)
+        near, far = draw_pairs(points, valid)
+        error = distance_error(points.unsqueeze(2), near.unsqueeze(2), far)
+        if valid is None:
+            error = error.mean((1, 2))
+        else:
+            known = valid.any(1)[other_tasks(len(points), points.device)]
+            pairs = valid.unsqueeze(2) & known.unsqueeze(1)
+            error = torch.where(pairs, error, 0.0).sum((1, 2)) / pairs.sum((1, 2)).clamp(min=1)
         batch = self.batch_shape(tensordict)
         return self.reduce(error.unsqueeze(-1).expand(batch), tensordict), {}
 

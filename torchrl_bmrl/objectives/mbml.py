@@ -18,11 +18,10 @@ from torchrl_bmrl.context_keys import CONTEXT
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.objectives.checks import check_network, check_number
 from torchrl_bmrl.objectives.context_rows import context_keys, encode_contexts
-from torchrl_bmrl.objectives.contexts import assign, group_rows, which_count
+from torchrl_bmrl.objectives.contexts import Embedded, assign, group_rows, which_count
 from torchrl_bmrl.objectives.data import next_key
 from torchrl_bmrl.objectives.distillation import MetaDistillationLoss
 from torchrl_bmrl.objectives.relabel import predict, read_reward
-from torchrl_bmrl.objectives.student_terms import Embedded
 
 
 class MBMLLoss(MetaDistillationLoss):
@@ -204,7 +203,7 @@ class MBMLLoss(MetaDistillationLoss):
         both = torch.cat([contexts.get(CONTEXT), relabelled], -1)
         points = self._points(both, rows)
         latent = assign(points, own, filled, apart=True)
-        return Embedded(latent, points, which_count(points, filled))
+        return Embedded(latent, points, which_count(points.shape[1], filled))
 
     def _transitions(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor | None]:
         keys = context_keys(self.task_encoder)
@@ -250,15 +249,17 @@ class MBMLLoss(MetaDistillationLoss):
     def _triplet_error(self, tensordict: TensorDictBase) -> Tensor:
         """Error of the relabelled contexts, ``(num_tasks, B)``: each row has its task's mean."""
         rows, valid = self._transitions(tensordict)
-        positive = group_rows(rows, self.context_size, valid)[0].get(CONTEXT)
+        contexts, _, filled = group_rows(rows, self.context_size, valid)
+        positive = contexts.get(CONTEXT)
         anchor, negative = self._relabelled(tensordict, rows, valid)
         mask = anchor.get("mask")
-        known = mask.any(-1)
+        own, known = which_count(positive.shape[1], filled), mask.any(-1)
         mask = mask | ~known.unsqueeze(-1)  # an empty context must not be pooled
         parts = [anchor.copy().set("mask", mask), positive, negative.copy().set("mask", mask)]
         points, near, far = self._points(torch.cat(parts, 1), rows).chunk(3, 1)
         error = functional.triplet_error(points, near, far, self.triplet_margin)
-        error = torch.where(known, error, 0.0).sum(-1) / known.sum(-1).clamp(min=1)
+        pairs = known if own is None else known & own
+        error = torch.where(pairs, error, 0.0).sum(-1) / pairs.sum(-1).clamp(min=1)
         return error.unsqueeze(-1).expand(tensordict.batch_size)
 
     @dispatch

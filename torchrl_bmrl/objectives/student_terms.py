@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
@@ -16,7 +16,7 @@ from torchrl_bmrl.context_keys import CONTEXT, transition_keys
 from torchrl_bmrl.contrast import contrastive_error, distance_error
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.objectives.context_rows import encode_contexts
-from torchrl_bmrl.objectives.contexts import assign, group_rows, which_count
+from torchrl_bmrl.objectives.contexts import Embedded, assign, group_rows, which_count
 from torchrl_bmrl.objectives.data import entry, next_key
 from torchrl_bmrl.objectives.lessons import Mix, demonstrate
 from torchrl_bmrl.objectives.task_rows import draw_others, draw_rows
@@ -70,14 +70,6 @@ def advantage(
     other = loss._run("student_qvalue_network", states, key, target, given)
     error = (value - other) - (target - taught.get(key))
     return (error.squeeze(-1) / loss.advantage_scale[:, None]).square()
-
-
-class Embedded(NamedTuple):
-    """m of a batch."""
-
-    latent: Tensor  # of each row, (num_tasks, B, m)
-    points: Tensor  # that the arranging terms compare: of the rows, or of the sets, likewise
-    valid: Tensor | None  # which of the points count
 
 
 def check_options(
@@ -185,7 +177,7 @@ def embed_sets(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> Embedd
     contexts, own, filled = group_rows(rows, loss.context_size, valid)
     points = encode_contexts(loss, contexts, rows, under)
     latent = assign(points, own, filled, apart=not under)
-    return Embedded(latent, points, which_count(points, filled))
+    return Embedded(latent, points, which_count(points.shape[1], filled))
 
 
 def arranging_errors(
@@ -212,7 +204,8 @@ def arranging_errors(
     if loss.distance_weight is not None:
         errors["distance"] = distance_error(points, near, far)
     if loss.contrastive_weight is not None:
-        errors["contrastive"] = contrastive_error(points, near, loss.temperature)
+        compared = None if valid is None else valid.any(1)
+        errors["contrastive"] = contrastive_error(points, near, loss.temperature, compared)
     if not loss.reads_sets:
         return errors
     count = torch.ones_like(points[..., 0]) if valid is None else valid.to(points.dtype)

@@ -79,6 +79,7 @@ def _import_files(run: Run) -> None:
                 demonstration_path(run.data_dir, task.name),
                 options=_options(task),
                 valid_share=task.files.valid_share,
+                context=run.settings.distill.reads_contexts,
                 bounds=_bounds_of_env(task) or shared,
             )
             bar.update(1)

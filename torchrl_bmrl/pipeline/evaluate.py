@@ -15,6 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.transforms import Transform
 
 from torchrl_bmrl.data.demonstrations import read_demonstrations, read_phases
+from torchrl_bmrl.data.robomimic_file import MASKS
 from torchrl_bmrl.envs.transforms import ObservationStatistics
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
@@ -191,10 +192,8 @@ def expert_outcomes(run: Run, name: str, seeds: list[int]) -> list[EpisodeOutcom
     task, collect = run.task(name), run.settings.collect
     if run.settings.evaluate.expert_rollouts and task.record is not None:
         return _play_experts(task, collect.experts_of(name), seeds)
-    # In context episodes other experts act.
-    several = task.record is not None and collect.context_episodes > 0
     outcomes = []
-    for split in ("train", "valid") if several else (None,):
+    for split in MASKS if collect.context_episodes else (None,):  # in the others, others act
         path, index = run.demonstrations(name), run.names.index(name)
         data = read_demonstrations(path, task, split=split, index=index)
         success = data.get(("next", "success"), None)

@@ -149,6 +149,11 @@ class DistillSettings:
     normalise_qvalue: bool = True  # with each teacher's mean and deviation
     prototype: str = setting("mean", choices=("mean", "medoid"))  # a task's point of m
 
+    @property
+    def reads_contexts(self) -> bool:
+        """Whether stage 2 reads episodes of another behaviour."""
+        return self.context == "given" or self.inference_updates > 0
+
     def check(self, latent_sources: list[str]) -> None:
         """Checks that the settings fit what the encoder of m reads.
 
@@ -268,8 +273,7 @@ class Settings:
                     f"valid with this generator: {default}, the default"
                 )
         distill.check(evaluate.latent_sources)
-        reads = distill.context == "given" or distill.inference_updates > 0
-        if reads and not self.collect.context_episodes:
+        if distill.reads_contexts and not self.collect.context_episodes:
             raise ConfigError(
                 f"distill.context is {distill.context}, distill.inference_updates "
                 f"{distill.inference_updates} and collect.context_episodes 0; valid: at least 1"

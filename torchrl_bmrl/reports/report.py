@@ -156,15 +156,16 @@ def write_report(
         sections.append(
             Section(heading=heading, paragraphs=explorer.paragraphs(), explorer=explorer)
         )
-    sections += [
-        Section(
-            heading="Stages and distances in the embedding",
-            paragraphs=note3,
-            tables=list(measures.values()),
-            pictures=list(drawn.values()),
-        ),
-        *studies,
-    ]
+    if embeddings:
+        sections.append(
+            Section(
+                heading="Stages and distances in the embedding",
+                paragraphs=note3,
+                tables=list(measures.values()),
+                pictures=list(drawn.values()),
+            )
+        )
+    sections += studies
     if returns:
         sections.append(Section(heading="Everything measured", tables=[returns["results"]]))
     page = run_dir / "report.html"
@@ -254,7 +255,7 @@ def _draw_embeddings(
 ) -> tuple[dict[str, Picture], list[str]]:
     """Draws the embedding, and notes what is left out."""
     if embeddings is None:
-        return {}, ["The figures of the embedding are left out: no embeddings were given."]
+        return {}, ["The figures of the embedding are left out: no transition has one of its own."]
     embeddings = embeddings.in_time()
     latent, task = embeddings.task_latent, embeddings.task
     names = [titles[name] for name in embeddings.tasks]
@@ -317,7 +318,9 @@ def _measure_embeddings(
     seed: int,
 ) -> tuple[dict[str, Table], dict[str, Picture], list[str]]:
     """Measures stages and distances in the embedding, and notes what is left out."""
-    if embeddings is None or training is None:
+    if embeddings is None:
+        return {}, {}, []
+    if training is None:
         return {}, {}, ["Stages and distances are left out: no training transitions were given."]
     notes, tables, pictures = [], {}, {}
     stages = measure_stages(training, embeddings, seed=seed)
