@@ -7,13 +7,14 @@
 #        action. It is the same for any data, and pulls the values of all actions together. After 500
 #        updates on rows with one action, a reward of 0 and terminations, the values of that action and
 #        of the two that never occur differ by less than 1e-5; with the published term, by more than 0.5.
-#        No warning.
+#        No warning. (Importing CQN needs peft, which a plain installation lacks.)
 set -euo pipefail
 
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 "${PYTHON:-python3}" -m venv "$folder/venv"
-"$folder/venv/bin/pip" install --quiet agilerl==2.58.0 torch==2.13.0 tensordict==0.13.0
+"$folder/venv/bin/pip" install --quiet agilerl==2.58.0 torch==2.13.0 tensordict==0.13.0 \
+    peft==0.21.2 transformers==5.24.0
 
 "$folder/venv/bin/python" -W ignore - <<'PY'
 from importlib.metadata import version
