@@ -161,3 +161,22 @@ def test_a_student_does_between_two_tasks_what_lies_between_its_teachers() -> No
     mixed, plain = error_between(0.7), error_between(0.0)
     assert mixed < 0.05
     assert mixed < plain / 2
+
+
+@pytest.mark.parametrize(("apart", "says"), [(0.0, False), (1.0, True)])
+def test_stage_2_warns_if_the_agents_do_not_know_the_states_they_are_asked_in(
+    apart: float, says: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    for extra in ("h5py", "safetensors", "yaml"):
+        pytest.importorskip(extra)
+    from torchrl_bmrl.pipeline.stage2 import warn_of_marks
+
+    tasks = []
+    for number in range(3):
+        observation = torch.randn(40, 4)
+        observation[:, 2] = 0.01 * torch.randn(40) + apart * number  # where the object lies
+        step = torch.arange(40) % 5
+        tasks.append(TensorDict({"observation": observation, "step": step}, [40]))
+    warn_of_marks(tasks)
+    assert ("1 of 4 numbers of the observation differ between the tasks" in caplog.text) == says
+    assert bool(caplog.records) == says

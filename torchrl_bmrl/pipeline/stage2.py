@@ -17,6 +17,7 @@ from torch.optim import Adam
 from torchrl_bmrl.data import make_multi_task_replay_buffer, with_previous
 from torchrl_bmrl.functional import nonzero_scale, sample_action_latent
 from torchrl_bmrl.modules import BCQPolicy, reads_context
+from torchrl_bmrl.modules.scales import unmarked
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.objectives import ContextInferenceLoss
 from torchrl_bmrl.pipeline.context_data import ContextSampler
@@ -172,6 +173,23 @@ def make_sampler(
     return sample
 
 
+def warn_of_marks(train: list[TensorDictBase]) -> None:
+    """Warns if agents of one task have not seen the states of another, in which mixing asks them.
+
+    Args:
+        train: the demonstrations of each task, ``[N_i]``.
+    """
+    read = unmarked(*train)
+    if (marks := int((read == 0).sum())) > 0:
+        log.warning(
+            "distill.mixing_fraction asks agents of other tasks in a task's states, and at the "
+            "start %d of %d numbers of the observation differ between the tasks; valid where these "
+            "numbers do not matter to the agents, otherwise 0",
+            marks,
+            len(read),
+        )
+
+
 def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
     """Trains a student, or resumes from its checkpoint."""
     run, student_job = job
@@ -183,6 +201,8 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
     if distill.context == "previous":
         train = [with_previous(data, TRANSITION_KEYS) for data in train]
     sample = make_sampler(run, distill, train)
+    if distill.mixing_fraction:
+        warn_of_marks(train)
 
     torch.manual_seed(run.seed("distill"))
     losses = [run.teacher(name) for name in run.names]
