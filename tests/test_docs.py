@@ -197,7 +197,9 @@ def test_every_command_of_a_recipe_gives_settings_that_it_takes(
     pytest.importorskip("robosuite", exc_type=ImportError)
     import command
 
-    importlib.import_module(recipe)  # adds the settings of its study
+    # Importing it adds the settings of its study, of which another test may have left others.
+    monkeypatch.delitem(sys.modules, recipe, raising=False)
+    importlib.import_module(recipe)
     # test_command_line.py reads the help, test_multirun.py runs the launchers.
     options = [word for word in words[2:] if not word.startswith(("--help", "hydra/", "hydra."))]
     if "--multirun" in options:

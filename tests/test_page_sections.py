@@ -71,7 +71,6 @@ def test_every_section_has_its_tables_and_pictures_in_order(page: str) -> None:
         (STAGE_1, ["Table 1: stage 1, one BCQ policy per task"], 1),
         (STAGE_2, ["Table 2: stage 2, one distilled policy for all tasks"], 0),
         ("The task embedding", [], 0),
-        ("Stages and distances in the embedding", [], 0),
         ("A study", ["Noise"], 0),
         ("Everything measured", ["Results"], 0),
     ]
