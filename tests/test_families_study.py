@@ -324,14 +324,15 @@ def test_a_student_is_trained_with_mixed_lessons_and_relabelled_contexts(
     for part in ("data", "bcq"):
         shutil.copytree(trained / part, tmp_path / part)
     module: Any = sys.modules[stage2.__module__]  # the package's function hides its name
-    names = ("make_distillation_loss", "ContextSampler")
-    loss, sampler = (Mock(wraps=getattr(module, name)) for name in names)
-    monkeypatch.setattr(module, names[0], loss)
-    monkeypatch.setattr(module, names[1], sampler)
+    names = ("make_distillation_loss", "ContextSampler", "warn_of_marks")
+    loss, sampler, warn = mocks = [Mock(wraps=getattr(module, name)) for name in names]
+    for name, mock in zip(names, mocks, strict=True):
+        monkeypatch.setattr(module, name, mock)
     with Run(configured(tmp_path, distill={"mixing_fraction": 0.25})) as run:
         stage2(run)
         data = [run.transitions(name, x) for name in run.names for x in ("train", "context")]
     assert loss.call_args.kwargs["mixing_fraction"] == 0.25
+    assert len(warn.call_args.args[0]) == len(run.names)
     reward = torch.cat([each["next", "reward"] for each in data])
     models = sampler.call_args.args[3]
     torch.testing.assert_close(models.module.reward_scale, reward.std(0))

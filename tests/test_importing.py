@@ -261,12 +261,13 @@ def test_too_few_episodes_beside_those_of_another_behaviour_are_refused(tmp_path
     robomimic.write_episodes(
         tmp_path / "own.hdf5", episodes, env_args=ENV_ARGS, masks={"context": [0, 1]}
     )
-    with pytest.raises(DataError, match="1 episodes outside mask/context; valid: at least two"):
+    with pytest.raises(DataError, match="one episode outside mask/context; valid: at least two"):
         import_demonstrations(tmp_path / "own.hdf5", tmp_path / "lift.hdf5")
 
 
-def test_a_single_episode_is_refused(tmp_path: Path) -> None:
-    robomimic.write_episodes(tmp_path / "own.hdf5", [make_episode()], env_args={})
+@pytest.mark.parametrize("masks", [{}, {"train": [0], "valid": [0]}])
+def test_a_single_episode_is_refused(tmp_path: Path, masks: dict[str, list[int]]) -> None:
+    robomimic.write_episodes(tmp_path / "own.hdf5", [make_episode()], env_args={}, masks=masks)
     with pytest.raises(DataError, match="one episode; valid: at least two"):
         import_demonstrations(tmp_path / "own.hdf5", tmp_path / "lift.hdf5")
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -14,11 +16,17 @@ pytest.importorskip("safetensors")
 pytest.importorskip("tqdm")
 
 import tiny_family
+from episode_files import make_episode
 from tiny_family import HORIZON
 
+from torchrl_bmrl.data import robomimic
 from torchrl_bmrl.data.robomimic import open_episodes
-from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.pipeline import Run, collect
+from torchrl_bmrl.errors import BMRLError, DataError
+from torchrl_bmrl.pipeline import Run, Settings, collect
+from torchrl_bmrl.pipeline.evaluate import expert_outcomes
+
+OFF = {"context": "set", "inference_updates": 0, "reward_updates": 0}
+"""Settings of a stage 2 that reads no episode of another behaviour."""
 
 pytestmark = pytest.mark.usefixtures("walk_family")
 
@@ -62,9 +70,7 @@ def test_context_episodes_are_of_other_members_experts_and_apart(collected: Path
 def test_the_number_of_context_episodes_does_not_change_the_demonstrations(
     collected: Path, tmp_path: Path
 ) -> None:
-    settings = tiny_family.settings(
-        tmp_path, {"context": "set", "inference_updates": 0, "reward_updates": 0}
-    )
+    settings = tiny_family.settings(tmp_path, OFF)
     with Run(replace(settings, collect=replace(settings.collect, context_episodes=0))) as run:
         collect(run)
         for name in run.names:
@@ -74,3 +80,37 @@ def test_the_number_of_context_episodes_does_not_change_the_demonstrations(
             )
             assert torch.equal(mine["action"], theirs["action"])
             assert torch.equal(mine["observation"], theirs["observation"])
+
+
+def from_file(folder: Path, path: Path, **distill: Any) -> Settings:
+    """Settings of a run on one user's file, whose episodes of another behaviour are in a mask."""
+    tasks = {name: {"demonstrations": str(path)} for name in ("mine", "yours")}
+    return replace(tiny_family.settings(folder, {**OFF, **distill}), tasks=tasks)
+
+
+def write_own(path: Path, masks: dict[str, list[int]]) -> Path:
+    """Four episodes, whose returns are 5, 10, 15 and 20."""
+    episodes = []
+    for number in range(4):
+        episode = make_episode(seed=number, parts={"x": ((3,), "f4")})
+        episodes.append(replace(episode, rewards=np.full(len(episode), number + 1.0)))
+    robomimic.write_episodes(path, episodes, env_args={}, masks=masks)
+    return path
+
+
+def test_a_file_without_episodes_of_another_behaviour_is_refused_before_it_is_imported(
+    tmp_path: Path,
+) -> None:
+    path = write_own(tmp_path / "own.hdf5", {})
+    with Run(from_file(tmp_path / "run", path, context="given")) as run:
+        with pytest.raises(DataError, match=r"own\.hdf5.*mask/context"):
+            collect(run)
+        assert not list(run.data_dir.glob("*.hdf5"))
+
+
+def test_the_expert_of_a_file_is_its_demonstrations_alone(tmp_path: Path) -> None:
+    path = write_own(tmp_path / "own.hdf5", {"context": [3]})
+    with Run(from_file(tmp_path / "run", path)) as run:
+        collect(run)
+        outcomes = expert_outcomes(run, "mine", [])
+    assert sorted(outcome.episode_return for outcome in outcomes) == [5.0, 10.0, 15.0]

@@ -286,16 +286,18 @@ def _masks(stream: Stream, valid_share: float) -> tuple[dict[str, Sequence[int]]
     """Positions of the episodes of each mask, and how they were chosen."""
     masks = dict(stream.metadata["masks"])
     stated = all(set(MASKS) <= set(source.metadata.get("masks", {})) for source in stream.sources)
-    if stated and masks["train"] and masks["valid"]:
-        return masks, "by the masks of the source"
-    others = set(masks.get(CONTEXT_MASK, ()))
+    stated = stated and bool(masks["train"] and masks["valid"])
+    others = set() if stated else set(masks.get(CONTEXT_MASK, ()))
     own = [i for i in range(len(stream.names)) if i not in others]
     if len(own) < 2:
-        found = f"{len(own)} episodes outside mask/{CONTEXT_MASK}" if others else "one episode"
-        message = f"{found}; valid: at least two, one to train on and one to hold out"
+        found = ("no episode", "one episode")[len(own)]
+        where = f" outside mask/{CONTEXT_MASK}" if others else ""
+        message = f"{found}{where}; valid: at least two, one to train on and one to hold out"
         raise DataError(stream.sources[0].path, None, message)
+    if stated:
+        return masks, "by the masks of the source"
     held_out = min(len(own) - 1, max(1, round(valid_share * len(own))))
     step = len(own) // held_out
     valid = own[step - 1 :: step][:held_out]
-    train = [i for i in own if i not in set(valid)]
+    train = [i for i in own if i not in valid]
     return masks | {"train": train, "valid": valid}, f"one in every {step}"

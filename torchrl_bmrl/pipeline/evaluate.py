@@ -193,7 +193,8 @@ def expert_outcomes(run: Run, name: str, seeds: list[int]) -> list[EpisodeOutcom
     if run.settings.evaluate.expert_rollouts and task.record is not None:
         return _play_experts(task, collect.experts_of(name), seeds)
     outcomes = []
-    for split in MASKS if collect.context_episodes else (None,):  # in the others, others act
+    # In the episodes of another behaviour, other experts act.
+    for split in MASKS if collect.context_episodes else (None,):
         path, index = run.demonstrations(name), run.names.index(name)
         data = read_demonstrations(path, task, split=split, index=index)
         success = data.get(("next", "success"), None)
