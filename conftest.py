@@ -60,6 +60,7 @@ _NEEDS = {
                 "mutations",
                 "reader_edits",
                 "recordings",
+                "tiny_family",
                 "tool_files",
             )
         ),
@@ -69,6 +70,7 @@ _NEEDS = {
     "hydra": ["tests/small_runs.py", "torchrl_bmrl/configs.py"],
     "matplotlib": [
         "tests/explorers.py",
+        "tests/families.py",
         "tests/published_data.py",
         "tests/report_data.py",
         "tests/weak_data.py",
@@ -94,12 +96,14 @@ _NEEDS = {
     ],
     "scipy": [
         "tests/explorers.py",
+        "tests/families.py",
         "tests/report_data.py",
         "torchrl_bmrl/evaluation/*",
         "torchrl_bmrl/reports/*",
     ],
     "sklearn": ["torchrl_bmrl/evaluation/embedding.py", "torchrl_bmrl/reports/figures.py"],
     "tqdm": [
+        "tests/tiny_family.py",
         "tests/tool_files.py",
         "torchrl_bmrl/data/__main__.py",
         "torchrl_bmrl/run/workers.py",

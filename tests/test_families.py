@@ -8,7 +8,6 @@ import pytest
 from torchrl_bmrl.envs.hidden import HIDDEN, LiftToHeight, PushTowards, ReachAtSpeed, ReachHidden
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.families import SPLITS, Family, get_family, registered_families, tasks_of
-from torchrl_bmrl.pipeline.task_files import make_tasks
 from torchrl_bmrl.tasks import DemonstrationFiles, Task, get_task
 
 SAWYER = tuple(HIDDEN)
@@ -62,6 +61,14 @@ def test_a_familys_name_stands_for_its_trained_members():
     family = get_family("push_towards")
     names = [task.name for task in family.tasks("train")]
     assert [task.name for task in tasks_of("push_towards")] == names
+
+
+def test_settings_take_a_familys_name_beside_tasks():
+    pytest.importorskip("h5py")
+    pytest.importorskip("tqdm")
+    from torchrl_bmrl.pipeline.task_files import make_tasks
+
+    names = [task.name for task in get_family("push_towards").tasks("train")]
     assert [task.name for task in make_tasks(["lift", "push_towards"])] == ["lift", *names]
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+pytest.importorskip("tqdm")
 from torchrl_bmrl.envs.hidden import LiftToHeight, PushTowards, ReachAtSpeed, ReachHidden
 from torchrl_bmrl.envs.table import TABLE_TOP
 from torchrl_bmrl.experts.sawyer_families import (

@@ -7,6 +7,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 
+pytest.importorskip("h5py")
+pytest.importorskip("safetensors")
+pytest.importorskip("tqdm")
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.modules import as_context, make_context_encoder, make_task_encoder
 from torchrl_bmrl.objectives import ContextInferenceLoss
