@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+pytest.importorskip("tqdm")
 from torchrl_bmrl.envs.hidden import HIDDEN, LiftToHeight, PushTowards, ReachAtSpeed, ReachHidden
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.families import SPLITS, Family, get_family, registered_families, tasks_of
@@ -65,7 +66,6 @@ def test_a_familys_name_stands_for_its_trained_members():
 
 def test_settings_take_a_familys_name_beside_tasks():
     pytest.importorskip("h5py")
-    pytest.importorskip("tqdm")
     from torchrl_bmrl.pipeline.task_files import make_tasks
 
     names = [task.name for task in get_family("push_towards").tasks("train")]
