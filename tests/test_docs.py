@@ -18,7 +18,8 @@ from helpers import NO_UPDATER
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 FILES = re.compile(r"<!-- file: \S+ -->\n```\w+\n.*?```", re.DOTALL)
-"""Files that a page shows: test_own_tasks.py writes and uses them."""
+"""Files that a page shows: test_own_tasks.py and test_own_family.py write and use them."""
+MODULES = re.compile(r"<!-- file: (\S+\.py) -->\n```python\n(.*?)```", re.DOTALL)
 BLOCKS = {
     page: re.findall(r"```python\n(.*?)```", FILES.sub("", page.read_text()), re.DOTALL)
     for page in PAGES
@@ -177,7 +178,7 @@ RECIPES = [(page, parts(line)) for page, line in COMMANDS if "python recipes/" i
     ids=[f"{page.stem}-{' '.join(words[1:])}" for page, words in RECIPES],
 )
 def test_every_command_of_a_recipe_gives_settings_that_it_takes(
-    page: Path, words: list[str], monkeypatch: pytest.MonkeyPatch
+    page: Path, words: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Only settings are checked here; test_recipes.py and its like run small recipes."""
     recipe = Path(words[1]).stem
@@ -191,6 +192,9 @@ def test_every_command_of_a_recipe_gives_settings_that_it_takes(
     from torchrl_bmrl.run.settings import check_settings
 
     monkeypatch.syspath_prepend(str(ROOT / "recipes"))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name, text in MODULES.findall(page.read_text()):
+        (tmp_path / name).write_text(text)
     if "@hydra.main" not in (ROOT / words[1]).read_text():  # it reads finished runs
         importlib.import_module(recipe).read_options(words[2:])
         return

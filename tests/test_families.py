@@ -8,8 +8,16 @@ import pytest
 pytest.importorskip("tqdm")
 from torchrl_bmrl.envs.hidden import HIDDEN, LiftToHeight, PushTowards, ReachAtSpeed, ReachHidden
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
-from torchrl_bmrl.families import SPLITS, Family, get_family, registered_families, tasks_of
-from torchrl_bmrl.tasks import DemonstrationFiles, Task, get_task
+from torchrl_bmrl.families import (
+    SPLITS,
+    Family,
+    find_family,
+    get_family,
+    register_family,
+    registered_families,
+    tasks_of,
+)
+from torchrl_bmrl.tasks import FAMILIES, DemonstrationFiles, Task, get_task
 
 SAWYER = tuple(HIDDEN)
 
@@ -70,6 +78,22 @@ def test_settings_take_a_familys_name_beside_tasks():
 
     names = [task.name for task in get_family("push_towards").tasks("train")]
     assert [task.name for task in make_tasks(["lift", "push_towards"])] == ["lift", *names]
+
+
+def test_of_two_families_with_the_same_trained_members_the_chosen_one_is_taken():
+    own = turning(name="rotate", members={"train": [(0,), (90,)], "inside": [], "outside": [(7,)]})
+    names = [task.name for task in own.tasks("train")]
+    register_family(turning())
+    try:
+        assert find_family(names, names).name == "turn"
+        register_family(own)
+        assert find_family(["mine:rotate"], names) is own
+        assert get_task("turn_7").name == "turn_7"  # of a family with another name
+        with pytest.raises(ConfigError, match=r"valid: .*tasks=\[turn\] or tasks=\[rotate\]"):
+            find_family(names, names)
+    finally:
+        FAMILIES.pop("turn")
+        FAMILIES.pop("rotate", None)
 
 
 def test_members_can_be_composed():

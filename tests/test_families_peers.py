@@ -187,21 +187,24 @@ def test_focal_acts_without_noise(trained: Path) -> None:
 # -- errors ----------------------------------------------------------------------------------------
 
 
-def test_a_peer_without_its_data_is_refused_before_anything_is_written(untrained: Path) -> None:
+def test_a_peer_of_a_run_without_other_behaviour_learns_from_demonstrations(
+    untrained: Path,
+) -> None:
     settings = tiny_family.settings(untrained, {"context": "set", "inference_updates": 0})
     settings = replace(settings, collect=replace(settings.collect, context_episodes=0))
     shutil.rmtree(untrained)
     with Run(settings) as run:
         for step in (collect, stage1, stage2):
             step(run)
-        with pytest.raises(ConfigError, match=r"families.focal.data is all .*valid: demonstrat"):
-            generalise(run, STUDY)
         small = replace(STUDY.focal, data="demonstrations", batch_size=7)
         with pytest.raises(ConfigError, match=r"families.focal.batch_size is 7; .*at least 8"):
             generalise(run, replace(STUDY, focal=small))
         assert not (untrained / "families").exists()
-        own = {name: replace(getattr(STUDY, name), data="demonstrations") for name in PEERS}
-        assert "MBML, given one demonstration" in generalise(run, replace(STUDY, **own))
+        assert [len(x) for x in peer_data(run, "all")] == [
+            len(x) for x in peer_data(run, "demonstrations")
+        ]
+        methods = [name for name in STUDY.methods if name != "behaviour"]
+        assert "MBML, given one demonstration" in generalise(run, replace(STUDY, methods=methods))
 
 
 def test_mbml_without_agents_and_a_peer_that_is_not_trained_are_typed_errors(

@@ -36,6 +36,7 @@ from torchrl_bmrl.pipeline.student import load_student
 from torchrl_bmrl.studies import families, families_methods
 from torchrl_bmrl.studies.families import generalise
 from torchrl_bmrl.studies.families_methods import METHODS, OWN, make_method
+from torchrl_bmrl.tasks import DemonstrationFiles
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 STUDY = tiny_family.study()
@@ -110,8 +111,8 @@ def test_a_row_has_the_return_of_the_demonstration_that_the_policy_is_given(
         assert float(row["data_return"]) == pytest.approx(given.rewards.sum(), rel=1e-6)
         assert row["family"] == "walk"
     run = Run(configured(studied[0]))
-    without = replace(make_walk(60.0), record=None, files=("walk.hdf5",))
-    assert families.data_return(run, STUDY, without, 0) == ""
+    without = replace(make_walk(60.0), record=None, files=DemonstrationFiles(path="no.hdf5"))
+    assert families.data_return(run, replace(STUDY, methods=["told"]), without, 0) == ""
 
 
 def test_a_method_s_file_of_an_earlier_version_is_refused_by_name(

@@ -23,6 +23,7 @@ from torchrl_bmrl.data.importing import (
     find_action_bounds,
     import_demonstrations,
     read_original_bounds,
+    read_scaled_episode,
 )
 from torchrl_bmrl.data.options import ReadOptions, join_bounds
 from torchrl_bmrl.errors import ConfigError, DataError, UnknownNameError
@@ -116,6 +117,27 @@ def test_lerobot_is_imported_with_its_rewards_and_successes(tmp_path: Path) -> N
         assert_allclose(ours.rewards, theirs.rewards, rtol=1e-6)
         assert_array_equal(ours.extras["successes"], theirs.extras["successes"])
     assert RobomimicExperienceReplay(tmp_path / "lift.hdf5", split="valid")[:]["episode"].numel()
+
+
+def test_an_episode_is_read_as_it_would_be_imported(tmp_path: Path) -> None:
+    made = write_file(tmp_path / "own.hdf5")
+    with h5py.File(tmp_path / "own.hdf5", "a") as file:
+        del file["mask"]
+        file["mask/context"] = np.array(["demo_1"], dtype="S")
+    imported, bounds = tmp_path / "lift.hdf5", (-2.0, 2.0)
+    import_demonstrations(tmp_path / "own.hdf5", imported, bounds=bounds)
+    expected = read(imported)
+    outside = [i for i in range(len(made)) if i != 1]
+    for index, position in enumerate(outside):
+        episode = read_scaled_episode(tmp_path / "own.hdf5", index, bounds=bounds)
+        assert_same(episode, expected[position])
+    other = read_scaled_episode(tmp_path / "own.hdf5", bounds=bounds, context=True)
+    assert_same(other, expected[1])
+    message = rf"{len(outside)} episodes outside mask/context; valid: at least {len(made)}"
+    with pytest.raises(DataError, match=message):
+        read_scaled_episode(tmp_path / "own.hdf5", len(outside))
+    with pytest.raises(DataError, match="1 episodes in mask/context; valid: at least 2"):
+        read_scaled_episode(tmp_path / "own.hdf5", 1, context=True)
 
 
 def test_a_folder_of_files_becomes_one_file(tmp_path: Path) -> None:

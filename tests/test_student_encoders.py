@@ -356,9 +356,10 @@ def test_sources_that_an_encoder_cannot_have_are_refused(name: str) -> None:
 def test_contexts_of_another_behaviour_must_be_collected(changes: dict[str, Any]) -> None:
     settings = Settings(distill=DistillSettings(**(SETS | changes)))
     with pytest.raises(ConfigError, match=r"collect.context_episodes 0; valid: at least 1"):
-        settings.check()
+        Run(settings)
+    Run(dataclasses.replace(settings, tasks={"mine": {"demonstrations": "mine.hdf5"}}))
     settings.collect = dataclasses.replace(settings.collect, context_episodes=1)
-    settings.check()
+    Run(settings)
 
 
 def test_tasks_of_no_family_cannot_be_told(tmp_path: Path) -> None:

@@ -193,6 +193,32 @@ def get_family(name: str) -> Family:
     return FAMILIES[rest]
 
 
+def find_family(chosen: Sequence[str], names: Sequence[str]) -> Family:
+    """The family whose trained members are the tasks of a run.
+
+    Args:
+        chosen: the names that the run's settings give; the name of a family decides.
+        names: of the run's tasks.
+
+    Raises:
+        ConfigError: if the tasks are not those of one family, or those of several.
+
+    Example:
+        >>> find_family(["push_towards"], []).title
+        'Push towards'
+    """
+    known = registered_families()
+    if len(chosen) == 1 and (name := chosen[0].rpartition(":")[2]) in known:
+        return FAMILIES[name]
+    found = [x for x in known if [task.name for task in FAMILIES[x].tasks("train")] == list(names)]
+    if len(found) == 1:
+        return FAMILIES[found[0]]
+    those = " or ".join(f"tasks=[{name}]" for name in found or known[:1])
+    raise ConfigError(
+        f"tasks is {', '.join(names)}; valid: the trained members of one family, such as {those}"
+    )
+
+
 def tasks_of(name: str) -> tuple[Task, ...]:
     """The task of a name, or the trained members of a family.
 

@@ -198,7 +198,7 @@ def _find(name: str, known: tuple[str, ...]) -> Task:
     if name in known:
         return _registry[name]
     for family in FAMILIES.values():
-        if name.startswith(family.name) and name in family.by_name:
+        if name in family.by_name:
             return family.make(*family.by_name[name])
     raise UnknownNameError("task", name, (*known, *FAMILIES))
 

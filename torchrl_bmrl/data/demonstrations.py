@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchrl_bmrl.data.datasets import RobomimicExperienceReplay
 from torchrl_bmrl.data.robomimic import open_episodes
+from torchrl_bmrl.data.robomimic_file import CONTEXT_MASK, read_metadata
 from torchrl_bmrl.envs.transforms import (
     ObservationStatistics,
     make_observation_transform,
@@ -37,6 +38,18 @@ TRANSITION_KEYS = (
 def demonstration_path(data_dir: Path, name: str) -> Path:
     """The file with the demonstrations of the task of a name."""
     return data_dir / f"{name}.hdf5"
+
+
+def has_contexts(path: Path) -> bool:
+    """Whether a file of demonstrations also has episodes of another behaviour.
+
+    Args:
+        path: a file in robomimic's layout.
+
+    Raises:
+        DataError: if it is missing or damaged.
+    """
+    return bool(read_metadata(path)["masks"].get(CONTEXT_MASK))
 
 
 def read_demonstrations(

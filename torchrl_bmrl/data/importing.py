@@ -136,6 +136,66 @@ def import_demonstrations(
     return Conversion(account=stream.account, notes=tuple(notes))
 
 
+def read_scaled_episode(
+    source: Paths,
+    index: int = 0,
+    *,
+    options: ReadOptions | None = None,
+    bounds: Bounds | None = None,
+    context: bool = False,
+) -> Episode:
+    """One of a user's demonstrations, as :func:`import_demonstrations` would write it.
+
+    Args:
+        source: as for :func:`import_demonstrations`.
+        index: number of the episode, from 0.
+        options: how the source is read; the defaults if ``None``.
+        bounds: lowest and highest action, which become -1 and 1: those of the data that a policy
+            was trained on (:func:`read_original_bounds`); of the source itself if ``None``.
+        context: count the episodes in the mask ``context``, of another behaviour, instead of those
+            outside it.
+
+    Raises:
+        ConfigError: for invalid options.
+        DataError: if the source is missing or damaged, has discrete actions or no rewards, or has
+            not so many episodes.
+
+    Example:
+        >>> import tempfile
+        >>> x, r = {"x": np.zeros((2, 3))}, np.zeros(2)
+        >>> episode = Episode(
+        ...     observations=x,
+        ...     next_observations=x,
+        ...     actions=np.full((2, 1), 0.25),
+        ...     rewards=r,
+        ...     terminated=r > 0,
+        ... )
+        >>> path = Path(tempfile.mkdtemp()) / "own.hdf5"
+        >>> robomimic.write_episodes(path, [episode], env_args={})
+        >>> read_scaled_episode(path, bounds=(-0.5, 0.5)).actions.tolist()
+        [[0.5], [0.5]]
+    """
+    chosen = None if bounds is None else check_bounds(bounds)
+    reading = vars(options or ReadOptions())
+    with open_sources(_expand(source), **reading) as sources:
+        _check_actions(sources)
+        bounds = chosen or _bounds_of(sources)
+        stream = Stream(with_bounds(sources, bounds))
+        others = set(stream.metadata["masks"].get(CONTEXT_MASK, ()))
+        left = index
+        for i, episode in enumerate(stream):
+            if (i in others) != context:
+                continue
+            if not left:
+                return _scaled(episode, bounds)
+            left -= 1
+        where = ("outside", "in")[context]
+        message = (
+            f"{index - left} episodes {where} mask/{CONTEXT_MASK}; valid: at least {index + 1}"
+        )
+        raise DataError(stream.sources[0].path, None, message)
+
+
 def find_action_bounds(
     source: Paths,
     *,

@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 from torchrl_bmrl.data.demonstrations import demonstration_path, write_statistics
-from torchrl_bmrl.data.importing import find_action_bounds, import_demonstrations
+from torchrl_bmrl.data.episodes import Episode
+from torchrl_bmrl.data.importing import (
+    find_action_bounds,
+    import_demonstrations,
+    read_original_bounds,
+    read_scaled_episode,
+)
 from torchrl_bmrl.data.options import Bounds, ReadOptions
 from torchrl_bmrl.data.sources import join_bounds
 from torchrl_bmrl.envs.gym import action_bounds
@@ -83,6 +89,33 @@ def _import_files(run: Run) -> None:
                 bounds=_bounds_of_env(task) or shared,
             )
             bar.update(1)
+
+
+def read_episode(run: Run, task: Task, index: int, *, context: bool = False) -> Episode:
+    """One episode of a task's files, with actions scaled as in the run's demonstrations.
+
+    Args:
+        run: the run, whose demonstrations are complete.
+        task: a task with files; it need not be one of the run's.
+        index: number of the episode, from 0.
+        context: count the episodes of another behaviour, instead of the others.
+
+    Raises:
+        DataError: as :func:`.read_scaled_episode`.
+    """
+    if task.name in run.names:  # scaled already
+        return read_scaled_episode(
+            run.demonstrations(task.name), index, bounds=(-1.0, 1.0), context=context
+        )
+    assert task.files is not None
+    bounds = _bounds_of_env(task) or read_original_bounds(run.demonstrations(run.names[0]))
+    return read_scaled_episode(
+        task.files.path,
+        index,
+        options=_options(task),
+        bounds=bounds or (-1.0, 1.0),
+        context=context,
+    )
 
 
 def _bounds_of_env(task: Task) -> Bounds | None:

@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.transforms import Transform
 
-from torchrl_bmrl.data.demonstrations import read_demonstrations, read_phases
+from torchrl_bmrl.data.demonstrations import has_contexts, read_demonstrations, read_phases
 from torchrl_bmrl.data.robomimic_file import MASKS
 from torchrl_bmrl.envs.transforms import ObservationStatistics
 from torchrl_bmrl.errors import ConfigError
@@ -189,13 +189,13 @@ def held_out_episode(run: Run, name: str) -> TensorDictBase:
 
 def expert_outcomes(run: Run, name: str, seeds: list[int]) -> list[EpisodeOutcome]:
     """Returns the expert's outcomes: new episodes from the seeds, or its demonstrations."""
-    task, collect = run.task(name), run.settings.collect
+    task, path = run.task(name), run.demonstrations(name)
     if run.settings.evaluate.expert_rollouts and task.record is not None:
-        return _play_experts(task, collect.experts_of(name), seeds)
+        return _play_experts(task, run.settings.collect.experts_of(name), seeds)
     outcomes = []
     # In the episodes of another behaviour, other experts act.
-    for split in MASKS if collect.context_episodes else (None,):
-        path, index = run.demonstrations(name), run.names.index(name)
+    for split in MASKS if has_contexts(path) else (None,):
+        index = run.names.index(name)
         data = read_demonstrations(path, task, split=split, index=index)
         success = data.get(("next", "success"), None)
         returns = data["next", "reward"].double()

@@ -18,6 +18,7 @@ from torchrl.envs.transforms import Transform
 
 from torchrl_bmrl.data.demonstrations import (
     demonstration_path,
+    has_contexts,
     load_transitions,
     read_statistics,
 )
@@ -25,12 +26,13 @@ from torchrl_bmrl.envs.gym import max_episode_steps
 from torchrl_bmrl.envs.transforms import ObservationStatistics, make_env
 from torchrl_bmrl.errors import BMRLError, ConfigError, UnknownNameError
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome, evaluate_policy
-from torchrl_bmrl.families import Family, get_family, registered_families
+from torchrl_bmrl.families import Family, find_family
 from torchrl_bmrl.objectives import BCQLoss
 from torchrl_bmrl.pipeline.agents import load_bcq_loss
 from torchrl_bmrl.pipeline.settings import SIX_TASKS, Settings
 from torchrl_bmrl.pipeline.student import Student, load_student
 from torchrl_bmrl.pipeline.task_files import (
+    check_contexts,
     check_names,
     make_tasks,
     read_task_file,
@@ -39,7 +41,7 @@ from torchrl_bmrl.pipeline.task_files import (
 )
 from torchrl_bmrl.run.locks import lock_run
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
-from torchrl_bmrl.tasks import Task, compose_tasks
+from torchrl_bmrl.tasks import Task, compose_tasks, import_module_of
 
 log = logging.getLogger(__name__)
 
@@ -85,6 +87,7 @@ class Run:
         self.tasks = tuple(with_run_options(task, settings) for task in made)
         check_names(settings, self.tasks)
         self.folder = Path(settings.run_dir)
+        check_contexts(settings, self.tasks)
         episodes = train_episodes(settings, self.tasks)
         collect = replace(settings.collect, train_episodes=episodes)
         self.settings = replace(settings, tasks=tasks, collect=collect)
@@ -113,6 +116,17 @@ class Run:
     def __getstate__(self) -> dict[str, Any]:
         return {name: self.__dict__[name] for name in ("settings", "folder", "tasks")}
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        for name in self._chosen:  # a worker knows no families but the library's
+            import_module_of("task", name)
+
+    @property
+    def _chosen(self) -> list[str]:
+        """The names that the settings give for the tasks; none for descriptions by name."""
+        tasks = self.settings.tasks
+        return list(tasks) if isinstance(tasks, Sequence) and not isinstance(tasks, str) else []
+
     # -- tasks ---------------------------------------------------------------------------------
 
     @property
@@ -130,13 +144,16 @@ class Run:
         """Whether every task has an environment."""
         return all(task.make_env is not None for task in self.tasks)
 
-    def check_playable(self) -> None:
+    def check_playable(self, others: Sequence[Task] = ()) -> None:
         """Checks that every task has an environment.
+
+        Args:
+            others: further tasks to check.
 
         Raises:
             ConfigError: naming the tasks without one.
         """
-        without = [task.name for task in self.tasks if task.make_env is None]
+        without = [task.name for task in (*self.tasks, *others) if task.make_env is None]
         if without:
             raise ConfigError(
                 f"{', '.join(without)} of tasks have no environment; valid: tasks that have one"
@@ -174,14 +191,7 @@ class Run:
         Raises:
             ConfigError: if they are not those of one family.
         """
-        for name in registered_families():
-            family = get_family(name)
-            if tuple(family.by_name)[: len(family.members["train"])] == self.names:
-                return family
-        raise ConfigError(
-            f"tasks is {', '.join(self.names)}; valid: the trained members of one family, such as "
-            f"tasks=[{registered_families()[0]}]"
-        )
+        return find_family(self._chosen, self.names)
 
     def codes(self) -> list[tuple[float, ...]]:
         """Numbers that a policy is given which is told the task, for each task of the family."""
@@ -245,6 +255,11 @@ class Run:
         return load_transitions(
             self.data_dir, self.tasks[index], self.statistics, split=split, index=index
         )
+
+    @property
+    def has_contexts(self) -> bool:
+        """Whether the demonstrations of every task have episodes of another behaviour."""
+        return all(has_contexts(self.demonstrations(name)) for name in self.names)
 
     def teacher(self, name: str) -> BCQLoss:
         """Returns the trained agent of a task, frozen.

@@ -273,11 +273,6 @@ class Settings:
                     f"valid with this generator: {default}, the default"
                 )
         distill.check(evaluate.latent_sources)
-        if distill.reads_contexts and not self.collect.context_episodes:
-            raise ConfigError(
-                f"distill.context is {distill.context}, distill.inference_updates "
-                f"{distill.inference_updates} and collect.context_episodes 0; valid: at least 1"
-            )
         if self.only is not None and self.bcq.stacked:
             raise ConfigError(f"only is {self.only}; valid with bcq.stacked: null")
         if device:

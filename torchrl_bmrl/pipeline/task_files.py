@@ -192,3 +192,14 @@ def train_episodes(settings: Settings, tasks: Sequence[Task]) -> dict[str, int]:
     # Numbers for tasks that are not in the run stay, as in folders of earlier versions.
     named = {name: number for name, number in given.items() if name != "default"}
     return {name: given.get(name, given.get("default", 0)) for name in recorded} | named
+
+
+def check_contexts(settings: Settings, tasks: Sequence[Task]) -> None:
+    """Raises an error for a run that reads episodes of another behaviour and records none."""
+    recorded = any(task.record is not None for task in tasks)
+    distill, count = settings.distill, settings.collect.context_episodes
+    if recorded and distill.reads_contexts and not count:
+        raise ConfigError(
+            f"distill.context is {distill.context}, distill.inference_updates "
+            f"{distill.inference_updates} and collect.context_episodes 0; valid: at least 1"
+        )

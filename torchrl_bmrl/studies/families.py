@@ -33,7 +33,9 @@ from torchrl_bmrl.studies.families_methods import (
     METHODS,
     OWN,
     FamilySettings,
+    check_files,
     context,
+    has_demonstrations,
     load_learner,
     make_method,
 )
@@ -79,14 +81,17 @@ def generalise(run: Run, settings: FamilySettings) -> str:
     """
     run.check_open()
     family, methods = run.family, settings.methods
-    run.check_playable()
+    members = held_out_members(run)
+    run.check_playable([task for _, task in members])
     student, _ = run.student()  # a missing policy is an error before anything is written
     if not reads_context(student.task_encoder):
         check_reads_transitions(student.task_encoder)
-    if "behaviour" in methods and not run.settings.collect.context_episodes:
+    if "behaviour" in methods and not run.has_contexts:
         raise ConfigError(
-            "families.methods has behaviour and collect.context_episodes is 0; valid: without it"
+            "families.methods has behaviour and the run has no episodes of another behaviour; "
+            "valid: without it"
         )
+    check_files(run, settings, [task for _, task in members])
     others = [student_job(run, settings, name) for name in settings.learners if name in _OTHERS]
     peers = [
         PeerJob(name, getattr(settings, name), f"{settings.folder}/{name}")
@@ -94,7 +99,7 @@ def generalise(run: Run, settings: FamilySettings) -> str:
         if name in PEERS
     ]
     for job in peers:
-        job.check(run)
+        job.check()
     open_run(run.folder / settings.folder, asdict(settings))
     run.jobs(
         train_student,
@@ -110,7 +115,6 @@ def generalise(run: Run, settings: FamilySettings) -> str:
         description="training the published methods",
         unit="update",
     )
-    members = held_out_members(run)
     steps = sum(run.horizon(task) for _, task in members) * settings.episodes * len(methods)
     jobs = [(settings, split, task) for split, task in members]
     results = run.jobs(play_member, jobs, total=steps, description="playing", unit="step")
@@ -250,7 +254,7 @@ def play_member(job: tuple[Run, Job], report: Report) -> list[dict[str, Any]]:
 
 
 def data_return(run: Run, settings: FamilySettings, task: Task, index: int) -> float | str:
-    """Mean return of the demonstrations that a policy is given; "" for a task without an expert.
+    """Mean return of the demonstrations that a policy is given; "" for a task without any.
 
     Args:
         run: the run.
@@ -258,7 +262,7 @@ def data_return(run: Run, settings: FamilySettings, task: Task, index: int) -> f
         task: the member.
         index: number of the episode.
     """
-    if task.record is None:
+    if not has_demonstrations(settings, task):
         return ""
     given = context(run, settings, task, "demonstration", index)
     return float(given["next", "reward"].double().sum()) / settings.demonstrations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
@@ -27,6 +27,7 @@ from torchrl_bmrl.modules import (
     PrototypeTaskLatent,
     embed_context,
 )
+from torchrl_bmrl.pipeline.collect import read_episode
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.student import load_student
 from torchrl_bmrl.run.settings import setting
@@ -227,13 +228,54 @@ def context(
     return torch.cat(episodes)
 
 
+def wanted(settings: FamilySettings) -> set[str]:
+    """What the methods are given of a member: ``"demonstration"``, ``"behaviour"``."""
+    given = {"cloning": "demonstration", **{name: way for name, (_, way) in _WAYS.items()}}
+    return {given.get(name, "") for name in settings.methods} & {"demonstration", "behaviour"}
+
+
+def has_demonstrations(settings: FamilySettings, task: Task) -> bool:
+    """Whether a member has demonstrations; without a method that is given one, none are needed.
+
+    Args:
+        settings: of the study.
+        task: the member.
+    """
+    if task.files is None or "demonstration" in wanted(settings):
+        return True
+    return Path(task.files.path).expanduser().exists()
+
+
+def check_files(run: Run, settings: FamilySettings, tasks: Sequence[Task]) -> None:
+    """Checks that the files of members have the episodes that the methods are given.
+
+    Args:
+        run: the run.
+        settings: of the study.
+        tasks: the members.
+
+    Raises:
+        DataError: naming the file that is missing or damaged, or has too few episodes.
+    """
+    last = settings.episodes * settings.demonstrations - 1
+    for task in tasks:
+        if task.files is None:
+            continue
+        if has_demonstrations(settings, task):
+            read_episode(run, task, last)
+        if "behaviour" in wanted(settings):
+            read_episode(run, task, last, context=True)
+
+
 def _record(run: Run, task: Task, method: str, index: int, path: Path) -> None:
-    """Records an episode of the member's expert that succeeds, or of another member's expert."""
+    """Stores an episode of the member's file or expert, or of another behaviour."""
+    if task.record is None:
+        episode = read_episode(run, task, index, context=method == "behaviour")
+        return keep_episode(path, episode)
     expert = run.settings.collect.experts_of(task.name)[0]
     seed_of = partial(run.seed, "families", method, task.name, index)
     if method == "demonstration":
         return keep_episode(path, record_success(task, expert, seed_of))
-    assert task.record is not None
     seed = run.seed("families", "like", task.name, index)
     like = others_than(run.tasks, "", seed=seed)
     given = {"noise": expert.noise, "gains": expert.gains, "like": like, **task.options}

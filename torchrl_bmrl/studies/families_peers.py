@@ -47,7 +47,7 @@ from torchrl_bmrl.training.update import (
 )
 
 DATA = ("all", "demonstrations")
-"""Data of a peer: the demonstrations alone, or also the episodes of other behaviour."""
+"""Data of a peer: all that the run has, or without the episodes of other behaviour."""
 
 
 @dataclass
@@ -173,22 +173,13 @@ class PeerJob:
     settings: FocalSettings | MBMLSettings
     folder: str
 
-    def check(self, run: Run) -> None:
-        """Checks that the run has the data that the settings want.
-
-        Args:
-            run: the run.
+    def check(self) -> None:
+        """Checks the settings.
 
         Raises:
-            ConfigError: for a run without episodes of other behaviour, or batches of less than two
-                contexts.
+            ConfigError: for batches of less than two contexts.
         """
         wanted = self.settings
-        if wanted.data == "all" and not run.settings.collect.context_episodes:
-            raise ConfigError(
-                f"families.{self.name}.data is all and collect.context_episodes is 0; valid: "
-                "demonstrations, or families.methods without it"
-            )
         if wanted.batch_size < 2 * wanted.context_size:
             raise ConfigError(
                 f"families.{self.name}.batch_size is {wanted.batch_size}; valid with context_size "
@@ -210,7 +201,7 @@ def peer_data(run: Run, source: str) -> list[TensorDictBase]:
         run: the run.
         source: one of :data:`DATA`.
     """
-    splits = ("train",) if source == "demonstrations" else ("train", "context")
+    splits = ("train", "context") if source == "all" and run.has_contexts else ("train",)
     return [torch.cat([run.transitions(name, x) for x in splits]) for name in run.names]
 
 
