@@ -177,7 +177,7 @@ PRESETS = sorted(path.stem for path in (RECIPES / "config" / "preset").glob("*.y
 def test_every_preset_is_complete_and_valid(recipes: Any, tmp_path: Path, preset: str) -> None:
     settings = settings_of(f"preset={preset}", f"run_dir={tmp_path}")
     settings.check()
-    families = {"family": "push_towards", "ml1": "ml1_reach"}
+    families = {"family": "push_towards", "ml1": "ml1_push"}
     if preset in families:
         assert Run(settings).family.name == families[preset]
         return
