@@ -11,13 +11,18 @@ from torchrl_bmrl.data.importing import (
     read_scaled_episode,
 )
 from torchrl_bmrl.data.options import Bounds, ReadOptions
+from torchrl_bmrl.data.robomimic_file import CONTEXT_MASK
 from torchrl_bmrl.data.sources import join_bounds
 from torchrl_bmrl.envs.gym import action_bounds
 from torchrl_bmrl.envs.transforms import make_env
+from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.experts.collect import collect_demonstrations
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.run.progress import progress
 from torchrl_bmrl.tasks import Task
+
+READ_NONE = "distill.context=set distill.inference_updates=0 distill.reward_updates=0"
+"""Settings of a stage 2 that reads no episodes of another behaviour."""
 
 
 def collect(run: Run) -> None:
@@ -80,14 +85,19 @@ def _import_files(run: Run) -> None:
     with progress(len(missing), "importing demonstrations", "file") as bar:
         for task in missing:
             assert task.files is not None
-            import_demonstrations(
-                task.files.path,
-                demonstration_path(run.data_dir, task.name),
-                options=_options(task),
-                valid_share=task.files.valid_share,
-                context=run.settings.distill.reads_contexts,
-                bounds=_bounds_of_env(task) or shared,
-            )
+            try:
+                import_demonstrations(
+                    task.files.path,
+                    demonstration_path(run.data_dir, task.name),
+                    options=_options(task),
+                    valid_share=task.files.valid_share,
+                    context=run.settings.distill.reads_contexts,
+                    bounds=_bounds_of_env(task) or shared,
+                )
+            except DataError as error:
+                if error.key == f"mask/{CONTEXT_MASK}":
+                    error.message += f", or settings that read none: {READ_NONE}"
+                raise
             bar.update(1)
 
 
