@@ -119,7 +119,7 @@ def test_files_without_other_behaviour_do_without_the_second_encoder(folder: Pat
     refused = replace(settings(folder), run_dir=str(folder / "refused"))
     with (
         Run(refused) as run,
-        pytest.raises(DataError, match="mask/context: names no .*distill.context=set"),
+        pytest.raises(DataError, match=r"mask/context: names no .*distill.context=set"),
     ):
         collect(run)
     with Run(settings(folder, READS_NONE)) as run:
