@@ -61,6 +61,12 @@ CELLS = (8,)
 NO_UPDATER = "ignore:No target network updater"
 
 
+def shown_files(page: Path) -> dict[str, str]:
+    """The files that a page shows whole, by name."""
+    found = re.findall(r"<!-- file: (\S+) -->\n```\w+\n(.*?)```", page.read_text(), re.DOTALL)
+    return dict(found)
+
+
 def task_transitions(
     num_tasks: int = TASKS, rows: int = ROWS, dtype: torch.dtype = torch.float64
 ) -> TensorDict:

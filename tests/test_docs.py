@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import get_type_hints
 
 import pytest
-from helpers import NO_UPDATER
+from helpers import NO_UPDATER, shown_files
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 FILES = re.compile(r"<!-- file: \S+ -->\n```\w+\n.*?```", re.DOTALL)
 """Files that a page shows: test_own_tasks.py and test_own_family.py write and use them."""
-MODULES = re.compile(r"<!-- file: (\S+\.py) -->\n```python\n(.*?)```", re.DOTALL)
 BLOCKS = {
     page: re.findall(r"```python\n(.*?)```", FILES.sub("", page.read_text()), re.DOTALL)
     for page in PAGES
@@ -193,7 +192,7 @@ def test_every_command_of_a_recipe_gives_settings_that_it_takes(
 
     monkeypatch.syspath_prepend(str(ROOT / "recipes"))
     monkeypatch.syspath_prepend(str(tmp_path))
-    for name, text in MODULES.findall(page.read_text()):
+    for name, text in shown_files(page).items():
         (tmp_path / name).write_text(text)
     if "@hydra.main" not in (ROOT / words[1]).read_text():  # it reads finished runs
         importlib.import_module(recipe).read_options(words[2:])

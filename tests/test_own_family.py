@@ -21,17 +21,23 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("sklearn")
 
 import tiny_family
+from helpers import shown_files
 from small_runs import RECIPES, recipe
 
+from torchrl_bmrl.data.importing import read_scaled_episode
+from torchrl_bmrl.data.robomimic import read_kept_episode
 from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.files import read_rows
 from torchrl_bmrl.pipeline import Run, collect, two_stage
+from torchrl_bmrl.studies import families
 from torchrl_bmrl.studies.families import generalise
 from torchrl_bmrl.tasks import FAMILIES
 
-PAGE = (RECIPES.parent / "docs" / "own_family.md").read_text()
-FILES = dict(re.findall(r"<!-- file: (\S+) -->\n```\w+\n(.*?)```", PAGE, re.DOTALL))
-BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.partition("## A new file")[2], re.DOTALL)
+PAGE = RECIPES.parent / "docs" / "own_family.md"
+FILES = shown_files(PAGE)
+BLOCKS = re.findall(
+    r"```python\n(.*?)```", PAGE.read_text().partition("## A new file")[2], re.DOTALL
+)
 FEW = [
     "preset=family",
     "tasks=[turns:turn]",
@@ -103,9 +109,13 @@ def test_the_page_leads_from_files_to_members_that_nobody_trained_on(folder: Pat
     given = returns(folder)
     assert len(given) == 5 * 3
     assert all(0.1 < float(value) <= 2.0 for values in given.values() for value in values)
-    stored = np.load(folder / "run/families/contexts/turn_45-demonstration-0.npz")
-    actions = next(stored[name] for name in stored.files if "actions" in name)
-    assert np.abs(actions).max() == pytest.approx(1)  # in the file they end at 0.1
+    for way, context in {"demonstration": False, "behaviour": True}.items():
+        path = folder / "run" / "families" / "contexts" / f"turn_45-{way}-1.npz"
+        in_file = read_scaled_episode(
+            folder / "turns" / "45.hdf5", 1, bounds=(-0.1, 0.1), context=context
+        )
+        assert np.allclose(read_kept_episode(path).actions, in_file.actions, atol=1e-6)
+        assert np.abs(in_file.actions).max() == pytest.approx(1)  # in the file they end at 0.1
 
     space: dict[str, Any] = {}
     exec(BLOCKS[0], space)
@@ -124,8 +134,14 @@ def test_files_without_other_behaviour_do_without_the_second_encoder(folder: Pat
         collect(run)
     with Run(settings(folder, READS_NONE)) as run:
         two_stage(run)
+        (folder / "turns" / "0.hdf5").unlink()  # of a trained member, whose data the run has
         with pytest.raises(ConfigError, match="behaviour and the run has no episodes of another"):
             generalise(run, tiny_family.study())
+        alone = replace(FAMILIES["turn"].tasks("inside")[0], make_env=None)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(families, "held_out_members", lambda run: [("inside", alone)])
+            with pytest.raises(ConfigError, match="turn_45 of tasks have no environment"):
+                generalise(run, tiny_family.study(methods=["demonstration"]))
         methods = ["demonstration", "one_shot", "focal", "mbml"]
         assert "FOCAL, given one" in generalise(run, tiny_family.study(methods=methods))
 
@@ -138,8 +154,18 @@ def test_a_held_out_file_that_is_short_or_missing_is_named_before_anything_is_tr
             del file["data"][name]
         del file["mask"]
 
+    def one_context_is_left(file: Any) -> None:
+        only = file["mask/context"][:1]
+        del file["mask/context"]
+        file["mask/context"] = only
+
     with Run(settings(folder)) as run:
         two_stage(run)
+        change(folder, 45, one_context_is_left)
+        short = r"turns/45.hdf5: 1 episodes in mask/context; valid: at least 2"
+        with pytest.raises(DataError, match=short):
+            generalise(run, tiny_family.study(methods=["behaviour"]))
+        assert not (folder / "run" / "families").exists()
         change(folder, 165, one_is_left)
         short = r"turns/165.hdf5: 1 episodes outside mask/context; valid: at least 2"
         with pytest.raises(DataError, match=short):

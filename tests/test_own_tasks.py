@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +13,7 @@ pytest.importorskip("h5py")
 pytest.importorskip("mujoco")
 pytest.importorskip("matplotlib")
 
+from helpers import shown_files
 from small_runs import RECIPES, recipe
 
 from torchrl_bmrl.data.importing import read_original_bounds
@@ -21,8 +21,8 @@ from torchrl_bmrl.evaluation import read_results
 from torchrl_bmrl.files import read_rows
 from torchrl_bmrl.pipeline.held_out import COLUMNS
 
-PAGE = (RECIPES.parent / "docs" / "tasks.md").read_text()
-FILES = dict(re.findall(r"<!-- file: (\S+) -->\n```\w+\n(.*?)```", PAGE, re.DOTALL))
+PAGE = RECIPES.parent / "docs" / "tasks.md"
+FILES = shown_files(PAGE)
 QUICK = ["preset=smoke", "bcq.updates_per_epoch=10", "distill.updates=10", "workers=1"]
 
 

@@ -125,7 +125,7 @@ class Run:
     def _chosen(self) -> list[str]:
         """The names that the settings give for the tasks; none for descriptions by name."""
         tasks = self.settings.tasks
-        return list(tasks) if isinstance(tasks, Sequence) and not isinstance(tasks, str) else []
+        return list(tasks) if isinstance(tasks, list) else []
 
     # -- tasks ---------------------------------------------------------------------------------
 

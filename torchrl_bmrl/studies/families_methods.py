@@ -229,7 +229,11 @@ def context(
 
 
 def wanted(settings: FamilySettings) -> set[str]:
-    """What the methods are given of a member: ``"demonstration"``, ``"behaviour"``."""
+    """What the methods are given of a member: ``"demonstration"``, ``"behaviour"``.
+
+    Args:
+        settings: of the study.
+    """
     given = {"cloning": "demonstration", **{name: way for name, (_, way) in _WAYS.items()}}
     return {given.get(name, "") for name in settings.methods} & {"demonstration", "behaviour"}
 
