@@ -96,6 +96,23 @@ def test_of_two_families_with_the_same_trained_members_the_chosen_one_is_taken()
         FAMILIES.pop("rotate", None)
 
 
+@pytest.mark.parametrize("kind", [list, tuple])
+def test_a_run_has_the_family_that_its_settings_name_in_any_sequence(kind, tmp_path):
+    pytest.importorskip("h5py")
+    pytest.importorskip("matplotlib")
+    from torchrl_bmrl.pipeline import Run
+    from torchrl_bmrl.pipeline.settings import Settings
+
+    own = turning(name="rotate", members={"train": [(0,), (90,)], "inside": [], "outside": [(7,)]})
+    try:
+        register_family(turning())
+        register_family(own)
+        assert Run(Settings(tasks=kind(["rotate"]), run_dir=str(tmp_path / "run"))).family is own
+    finally:
+        FAMILIES.pop("turn", None)
+        FAMILIES.pop("rotate", None)
+
+
 def test_members_can_be_composed():
     parts = [
         get_family("reach_hidden").tasks("train")[0],

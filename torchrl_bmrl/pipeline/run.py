@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
 from functools import cached_property
@@ -125,7 +125,7 @@ class Run:
     def _chosen(self) -> list[str]:
         """The names that the settings give for the tasks; none for descriptions by name."""
         tasks = self.settings.tasks
-        return list(tasks) if isinstance(tasks, list) else []
+        return [] if isinstance(tasks, Mapping) else list(tasks)
 
     # -- tasks ---------------------------------------------------------------------------------
 
