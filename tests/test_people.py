@@ -43,6 +43,23 @@ def test_settings_that_are_not_valid_are_refused(values: dict[str, Any], says: s
         check_settings(HumanSettings(**values), "human.")
 
 
+@pytest.mark.parametrize("task", ["lift_to_height_8", "reach"])
+def test_the_agents_are_those_of_the_named_task_beside_a_family(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, task: str
+) -> None:
+    taught: list[str] = []
+
+    def alone(settings: Settings) -> Run:
+        taught.extend(Run(settings).names)
+        raise BMRLError("enough")
+
+    monkeypatch.setattr(people, "Run", alone)
+    settings = Settings(run_dir=str(tmp_path / "run"), tasks=["lift_to_height", "reach"])
+    with pytest.raises(BMRLError, match="enough"), Run(settings) as run:
+        learn_from_people(run, HumanSettings(path="any.hdf5", task=task))
+    assert taught == [task]
+
+
 @pytest.mark.parametrize(
     ("values", "says"),
     [

@@ -18,6 +18,7 @@ from torchrl_bmrl.envs.transforms import transform_data
 from torchrl_bmrl.errors import ConfigError, UnknownNameError
 from torchrl_bmrl.evaluation import bootstrap_interval
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
+from torchrl_bmrl.families import tasks_of
 from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.pipeline.collect import collect
@@ -81,7 +82,10 @@ def learn_from_people(run: Run, settings: HumanSettings) -> str:
     if isinstance(tasks, Mapping):
         tasks = {settings.task: tasks[settings.task]}
     else:
-        tasks = [tasks[run.names.index(settings.task)]]
+        # A family's name stands for its members. The module before it makes them known.
+        of = next(x for x in tasks if settings.task in [task.name for task in tasks_of(x)])
+        module, colon, _ = of.rpartition(":")
+        tasks = [f"{module}{colon}{settings.task}"]
     alone = Run(replace(run.settings, run_dir=str(folder / "run"), base=None, tasks=tasks))
     alone.check_playable()
     # More shares and seeds may join the finished ones, with the same demonstrations.
