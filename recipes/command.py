@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
-import os
 
-import torchrl_bmrl.run.as_command  # noqa: F401 (first: it turns errors at import into one line)
+import torchrl_bmrl.run.as_command  # first: it turns errors at import into one line
+import torchrl_bmrl.run.early_server  # noqa: F401 (before torch)
 from torchrl_bmrl.extras import needs
 
-os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
-
+# isort: split
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from copy import deepcopy

@@ -73,6 +73,8 @@ class Task:
         success: key of the environment's ``info`` that tells success; ``None``: the task has no
             definition of success, and tables show returns alone.
         title: name in tables and figures; by default the name with spaces for underscores.
+        simulator: module that environments and experts import at their first use; worker processes
+            share it.
         compose: makes the task of several tasks in a row, for names such as ``"reach-lift"``.
 
     Raises:
@@ -94,6 +96,7 @@ class Task:
     horizon: int | None = None
     success: str | None = None
     title: str = ""
+    simulator: str | None = None
     compose: Callable[[Sequence[Task]], Task] | None = None
 
     def __post_init__(self) -> None:

@@ -164,6 +164,7 @@ def collect_demonstrations(
         total=len(jobs),
         description="collecting demonstrations",
         unit="episode",
+        preload=[task.simulator for task in tasks if task.simulator],
     )
     for name, paths in parts.items():
         first, count = read_kept_episode(paths[0]), len(chosen[name])

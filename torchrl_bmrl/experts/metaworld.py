@@ -183,6 +183,7 @@ def make_ml1_task(name: str, env: str, rand_vec: Vector) -> Task:
     return Task(
         name=name,
         make_env=make_ml1_env,
+        simulator="torchrl_bmrl.envs.metaworld",
         record=record_ml1_episode,
         parts=("observation",),
         options={"env": env, "rand_vec": rand_vec, "horizon": HORIZON},

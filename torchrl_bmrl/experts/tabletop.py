@@ -75,6 +75,7 @@ def _make_task(
     return Task(
         name="-".join(skill.name for skill in skills),
         make_env=make_tabletop_env,
+        simulator="torchrl_bmrl.envs.vector",
         record=partial(record_episode, experts=tuple(experts)),
         parts=("robot0_joint_pos", *OBSERVATION_PARTS[2:]),
         observation=observation_transforms,

@@ -345,6 +345,7 @@ class Run:
             total=total,
             description=description,
             unit=unit,
+            preload=[task.simulator for task in self.tasks if task.simulator],
         )
 
     def make_env(self, task: Task, *transforms: Transform, num_envs: int) -> TransformedEnv:

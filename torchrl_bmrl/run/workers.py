@@ -8,12 +8,13 @@ import logging
 import logging.handlers
 import multiprocessing
 import os
+import sys
 import threading
 import time
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.pool import RemoteTraceback  # type: ignore[attr-defined]
 from typing import Any, TypeVar
@@ -21,6 +22,7 @@ from typing import Any, TypeVar
 import torch
 
 from torchrl_bmrl.errors import BMRLError, StoppedError
+from torchrl_bmrl.run.forked import METHOD, one_thread, start_server
 from torchrl_bmrl.run.logs import LOGGER
 from torchrl_bmrl.run.progress import Progress, progress
 from torchrl_bmrl.run.stops import check_stop, stop_worker_on_signals
@@ -64,11 +66,13 @@ def run_jobs(
     total: int,
     description: str,
     unit: str,
+    preload: Iterable[str] = (),
 ) -> list[Result]:
     """Calls ``function(job, report)`` for every job and returns the results in the jobs' order.
 
     With more than one worker the jobs run in new processes, so ``function`` and the jobs must be
-    importable by name. Every job uses one thread. Log records of workers reach this process.
+    importable by name. Every job uses one thread. Log records of workers reach this process. On
+    Linux workers share what they import (:mod:`torchrl_bmrl.run.forked`).
 
     If a worker dies, for example for lack of memory, a warning is logged and another worker runs
     the job again, from its start or its last checkpoint. A worker that reports nothing for
@@ -84,6 +88,7 @@ def run_jobs(
         total: units of all jobs, for the progress (:func:`~torchrl_bmrl.run.progress.progress`).
         description: name of the jobs, such as ``"training"``.
         unit: name of a unit, in the singular.
+        preload: modules that the jobs import and this process does not, such as a simulator's.
 
     Raises:
         BMRLError: if a job's workers die three times.
@@ -111,31 +116,20 @@ def run_jobs(
                 return [function(job, report) for job in jobs]
             finally:
                 torch.set_num_threads(threads)
-        with _one_thread_each():
+        start_server(function.__module__, *preload)
+        with one_thread():
             return _run_in_processes(function, jobs, workers, bar, description)
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    before = os.environ.get("OMP_NUM_THREADS")
-    os.environ["OMP_NUM_THREADS"] = "1"  # read by the children's numpy at import
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["OMP_NUM_THREADS"]
-        else:
-            os.environ["OMP_NUM_THREADS"] = before
 
 
 class _Worker:
     """A worker process and its current job."""
 
     def __init__(self, function: Callable[[Job, Report], Result]) -> None:
-        context = multiprocessing.get_context("spawn")
+        context: Any = multiprocessing.get_context(METHOD)
         self.connection, theirs = context.Pipe()
         level = LOGGER.getEffectiveLevel()
-        self.process = context.Process(target=_serve, args=(theirs, function, level), daemon=True)
+        arguments = (theirs, function, level, dict(os.environ))
+        self.process = context.Process(target=_serve, args=arguments, daemon=True)
         self.process.start()
         theirs.close()  # so that the process's end closes the pipe
         self.job = -1  # number of the job
@@ -174,8 +168,16 @@ class _SendRecords(logging.handlers.QueueHandler):
             self.connection.send(("log", record))
 
 
-def _serve(connection: Connection, function: Callable[[Job, Report], Result], level: int) -> None:
+def _serve(
+    connection: Connection,
+    function: Callable[[Job, Report], Result],
+    level: int,
+    environment: dict[str, str],
+) -> None:
     """Main loop of a worker: receives jobs, sends reports and results."""
+    os.environ.update(environment)  # a forked worker has that of its server
+    if (numpy := sys.modules.get("numpy")) is not None:
+        numpy.random.seed()  # and the random state: without a seed, all would draw the same
     LOGGER.setLevel(level)
     LOGGER.handlers, LOGGER.propagate = [_SendRecords(connection)], False
     torch.set_num_threads(1)

@@ -1,0 +1,111 @@
+"""Workers that are copies of a server: what they share with it and what is their own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("tqdm")
+
+from torchrl_bmrl.run.forked import METHOD
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(METHOD != "forkserver", reason="workers are copies on Linux only"),
+]
+
+SCRIPT = """
+import json, os, signal, sys, time
+from multiprocessing import forkserver
+from torchrl_bmrl.run.workers import run_jobs
+
+OPTIONS = {"workers": 2, "total": 2, "description": "working", "unit": "job"}
+
+def before(job, report):
+    return {"modules": [name for name in ("wave", "broken") if name in sys.modules],
+            "said": os.environ.get("SAID"),
+            "of_the_server": "TORCHRL_BMRL_SERVER_IMPORTS" in os.environ,
+            "handler": str(signal.getsignal(signal.SIGTERM))}
+
+def draw(job, report):
+    import numpy
+    time.sleep(0.5)
+    return numpy.random.rand()
+
+def server():
+    return forkserver._forkserver._forkserver_pid
+"""
+
+
+def run(folder: Path, *lines: str) -> list[Any]:
+    """Runs lines of a script with the functions above; returns what they print, as JSON."""
+    (folder / "broken.py").write_text("raise ValueError('no import')\n")
+    script = folder / "script.py"
+    body = "\n".join(f"    {line}" for line in lines)
+    script.write_text(f'{SCRIPT}\nif __name__ == "__main__":\n{body}\n')
+    done = subprocess.run(
+        [sys.executable, str(script)], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def test_workers_have_imported_what_their_server_has_and_an_import_that_fails_stops_no_worker(
+    tmp_path: Path,
+) -> None:
+    (found,) = run(
+        tmp_path,
+        'preload = ["broken", "no_such_module", "wave"]',
+        "print(json.dumps(run_jobs(before, [0, 1], preload=preload, **OPTIONS)))",
+    )
+    assert [each["modules"] for each in found] == [["wave"], ["wave"]]
+    assert not any(each["of_the_server"] for each in found)
+
+
+def test_a_worker_has_the_environment_of_the_moment_and_handles_its_own_signals(
+    tmp_path: Path,
+) -> None:
+    first, second = run(
+        tmp_path,
+        "print(json.dumps(run_jobs(before, [0, 1], **OPTIONS)))",
+        'os.environ["SAID"] = "later"',
+        "print(json.dumps(run_jobs(before, [0, 1], **OPTIONS)))",
+    )
+    assert [each["said"] for each in first + second] == [None, None, "later", "later"]
+    assert all("note" in each["handler"] for each in first + second)
+
+
+def test_workers_do_not_draw_the_same_without_a_seed(tmp_path: Path) -> None:
+    (found,) = run(tmp_path, "print(json.dumps(run_jobs(draw, [0, 1], **OPTIONS)))")
+    assert found[0] != found[1]
+
+
+def test_a_killed_server_is_replaced(tmp_path: Path) -> None:
+    first, second, pids = run(
+        tmp_path,
+        "print(json.dumps(run_jobs(before, [0, 1], **OPTIONS)))",
+        "pids = [server()]",
+        "os.kill(pids[0], signal.SIGKILL)",
+        "time.sleep(0.5)",
+        "print(json.dumps(run_jobs(before, [0, 1], **OPTIONS)))",
+        "print(json.dumps([*pids, server()]))",
+    )
+    assert len(first) == len(second) == 2
+    assert pids[0] != pids[1]
+
+
+def test_signals_to_all_processes_leave_the_server_to_its_workers(tmp_path: Path) -> None:
+    (alive,) = run(
+        tmp_path,
+        "run_jobs(before, [0, 1], **OPTIONS)",
+        "for name in ('SIGINT', 'SIGTERM', 'SIGHUP'):",
+        "    os.kill(server(), getattr(signal, name))",
+        "time.sleep(0.5)",
+        "print(json.dumps(os.waitpid(server(), os.WNOHANG)[0] == 0))",
+    )
+    assert alive
