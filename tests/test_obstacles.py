@@ -12,7 +12,7 @@ pytest.importorskip("robosuite", exc_type=ImportError)
 
 from stock_robosuite import assert_same, assert_same_steps, both, controller, make, random_actions
 
-from torchrl_bmrl.envs import control_period
+from torchrl_bmrl.envs import control_period, operational_space
 from torchrl_bmrl.envs.acceleration import accelerate_robosuite
 from torchrl_bmrl.envs.obstacles import why_not_fast
 from torchrl_bmrl.errors import BMRLError
@@ -35,7 +35,7 @@ def replaced(patch: Any, env: Any, what: str) -> None:
         "gripper": lambda: patch.setitem(parts, "right_gripper", object()),
         "interpolation": lambda: patch.setattr(arm, "interpolator_pos", object()),
         "parts": lambda: patch.setitem(robot._enabled_parts, "right", False),
-        "numba": lambda: patch.setattr(control_period, "opspace_matrices", lambda *_: None),
+        "numba": lambda: patch.setattr(operational_space, "OF_ROBOSUITE", (None, lambda *_: None)),
         "joints": lambda: patch.setattr(arm, "qpos_index", arm.qpos_index[::-1]),
     }
     changes[what]()

@@ -1,9 +1,9 @@
 """The compiled loop of a control period: operational-space control and MuJoCo's substeps.
 
-robosuite remains the definition. The loop calls its compiled functions (``opspace_matrices``,
-``nullspace_torques``, ``orientation_error``). Where robosuite uses plain numpy, the loop does the
-same operations in the same order and calls numpy for matrix products: a different order of
-additions changes the last bit, and contacts can turn that into millimetres (docs/simulator.md).
+robosuite remains the definition. The loop does its operations in their order, and calls the same
+routines for matrix products and inverses (:mod:`torchrl_bmrl.envs.linear_algebra`): a different
+order of additions changes the last bit, and contacts can turn that into millimetres
+(docs/simulator.md).
 """
 
 from __future__ import annotations
@@ -15,6 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from torchrl_bmrl.envs.caching import cached_njit
+from torchrl_bmrl.envs.linear_algebra import Space, numpys_product
+from torchrl_bmrl.envs.operational_space import (
+    nullspace_torques,
+    opspace_matrices,
+    orientation_error,
+)
 from torchrl_bmrl.envs.physics import mujoco_library
 from torchrl_bmrl.extras import needs
 
@@ -22,11 +28,6 @@ with needs("robosuite"):
     import mujoco
     from llvmlite import binding
     from numba import types
-    from robosuite.utils.control_utils import (
-        nullspace_torques,
-        opspace_matrices,
-        orientation_error,
-    )
 
 # Compiled code finds its functions by name.
 LIBRARY = mujoco_library(Path(mujoco.__file__).parent, mujoco.__version__, sys.platform)
@@ -38,10 +39,6 @@ _mj_step1 = types.ExternalFunction("mj_step1", types.void(_address, _address))
 _mj_step2 = types.ExternalFunction("mj_step2", types.void(_address, _address))
 _mj_forward = types.ExternalFunction("mj_forward", types.void(_address, _address))
 _mj_jac_site = types.ExternalFunction("mj_jacSite", types.void(*[_address] * 4, types.int32))
-_py_call = types.ExternalFunction("PyObject_Call", _address(*[_address] * 3))
-_py_decref = types.ExternalFunction("Py_DecRef", types.void(_address))
-# Without the dispatch to other libraries' arrays, which takes as long as a small product.
-DOT = getattr(np.dot, "_implementation", np.dot)
 
 
 class Robot(NamedTuple):
@@ -49,7 +46,7 @@ class Robot(NamedTuple):
 
     model: int  # address
     data: int  # address
-    dot: int  # address of np.dot
+    direct: bool  # numpy's BLAS can be called without Python
     lite: bool  # physics in two halves, robosuite's default
     arm_lite: bool  # the controller does not evaluate the physics again
     site: int  # end-effector
@@ -72,7 +69,7 @@ class Robot(NamedTuple):
 class Arm(NamedTuple):
     """The arm as its controller saw it last; all but the first five are the controller's own."""
 
-    mass: np.ndarray  # (n, n)
+    mass: np.ndarray  # (n, n), that of the space
     joint_position: np.ndarray  # (n,)
     joint_velocity: np.ndarray  # (n,)
     torque: np.ndarray  # (n,), before it is clipped
@@ -91,21 +88,20 @@ class Scratch(NamedTuple):
 
     jacobian_position: np.ndarray  # (3, nv)
     jacobian_rotation: np.ndarray  # (3, nv)
-    lambda_position: np.ndarray  # (3, 3)
-    lambda_rotation: np.ndarray  # (3, 3)
     force: np.ndarray  # (3,)
     torque: np.ndarray  # (3,)
+    error: np.ndarray  # (3,), of the rotation
     joint_torque: np.ndarray  # (n,)
 
 
 class Products(NamedTuple):
-    """Addresses of the arguments ``(a, b, out)`` of ``np.dot``."""
+    """Arguments of :func:`.linear_algebra.numpys_product`."""
 
-    velocity: int
-    angular_velocity: int
-    force: int
-    torque: int
-    joint_torque: int
+    velocity: np.ndarray
+    angular_velocity: np.ndarray
+    force: np.ndarray
+    torque: np.ndarray
+    joint_torque: np.ndarray
 
 
 class Base(NamedTuple):
@@ -119,10 +115,10 @@ class Base(NamedTuple):
     velocity: np.ndarray  # (3,)
     angular_velocity: np.ndarray  # (3,)
     goal_offset: np.ndarray  # (3,), of the goal from the site
-    velocity_product: int  # addresses, as of Products
-    angular_velocity_product: int
-    goal_offset_product: int
-    goal_rotation_product: int
+    velocity_product: np.ndarray  # as of Products
+    angular_velocity_product: np.ndarray
+    goal_offset_product: np.ndarray
+    goal_rotation_product: np.ndarray
 
 
 class Goal(NamedTuple):
@@ -137,9 +133,17 @@ class Goal(NamedTuple):
 
 
 @cached_njit
-def _numpy_dot(dot: int, arguments: int) -> None:
-    # numpy's BLAS is not the one that numba calls, and rounds differently.
-    _py_decref(_py_call(dot, arguments, 0))
+def _copy(source: np.ndarray, start: int, target: np.ndarray) -> None:
+    # Into an array of one dimension; assigning slices takes numba seconds to compile.
+    for i in range(len(target)):
+        target[i] = source[start + i]
+
+
+@cached_njit
+def _copy_columns(source: np.ndarray, first: int, part: np.ndarray, whole: np.ndarray) -> None:
+    for i in range(part.shape[0]):
+        for j in range(part.shape[1]):
+            part[i, j] = whole[i, j] = source[i, first + j]
 
 
 @cached_njit
@@ -162,7 +166,11 @@ def _mass_matrix(robot: Robot, mass: np.ndarray) -> None:
 
 @cached_njit
 def _velocities(
-    robot: Robot, site: int, buffers: Scratch | Base, velocity: int, angular_velocity: int
+    robot: Robot,
+    site: int,
+    buffers: Scratch | Base,
+    velocity: np.ndarray,
+    angular_velocity: np.ndarray,
 ) -> None:
     # The arguments of the two products refer to the Jacobians in the buffers.
     _mj_jac_site(
@@ -172,8 +180,8 @@ def _velocities(
         buffers.jacobian_rotation.ctypes.data,
         site,
     )
-    _numpy_dot(robot.dot, velocity)
-    _numpy_dot(robot.dot, angular_velocity)
+    numpys_product(robot.direct, velocity)
+    numpys_product(robot.direct, angular_velocity)
 
 
 @cached_njit
@@ -184,6 +192,7 @@ def control_period(
     robot: Robot,
     arm: Arm,
     scratch: Scratch,
+    space: Space,
     products: Products,
     goal: Goal,
     base: Base | None,
@@ -195,7 +204,6 @@ def control_period(
     does after a reset.
     """
     n, first, nq = len(arm.torque), robot.dof, len(robot.qpos)
-    joints, dofs = slice(robot.joint, robot.joint + n), slice(first, first + n)
     for substep in range(substeps):
         if substep or not evaluated:
             if robot.lite:
@@ -207,23 +215,23 @@ def control_period(
         if substep or not seen:
             _velocities(robot, robot.site, scratch, products.velocity, products.angular_velocity)
             _mass_matrix(robot, arm.mass)
-            arm.position[:] = robot.site_position
-            arm.rotation[:] = robot.site_rotation
-            arm.jacobian_position[:] = scratch.jacobian_position[:, dofs]
-            arm.jacobian_rotation[:] = scratch.jacobian_rotation[:, dofs]
-            arm.jacobian[:3] = arm.jacobian_position
-            arm.jacobian[3:] = arm.jacobian_rotation
-            arm.joint_position[:] = robot.qpos[joints]
-            arm.joint_velocity[:] = robot.qvel[dofs]
+            _copy(robot.site_position, 0, arm.position)
+            _copy_columns(robot.site_rotation, 0, arm.rotation, arm.rotation)
+            _copy_columns(scratch.jacobian_position, first, arm.jacobian_position, arm.jacobian)
+            lower = arm.jacobian[3:]
+            _copy_columns(scratch.jacobian_rotation, first, arm.jacobian_rotation, lower)
+            _copy(robot.qpos, robot.joint, arm.joint_position)
+            _copy(robot.qvel, first, arm.joint_velocity)
         if base is not None:
             _velocities(
                 robot, base.site, base, base.velocity_product, base.angular_velocity_product
             )
             if base.goal_is_local:
-                _numpy_dot(robot.dot, base.goal_offset_product)
-                _numpy_dot(robot.dot, base.goal_rotation_product)
-                goal.position[:] = base.position + base.goal_offset
-        error = orientation_error(goal.rotation, arm.rotation)
+                numpys_product(robot.direct, base.goal_offset_product)
+                numpys_product(False, base.goal_rotation_product)  # of two matrices
+                for i in range(3):
+                    goal.position[i] = base.position[i] + base.goal_offset[i]
+        orientation_error(goal.rotation, arm.rotation, scratch.error)
         for i in range(3):
             slowing, turning = arm.velocity[i], arm.angular_velocity[i]
             if base is not None:
@@ -231,28 +239,22 @@ def control_period(
             scratch.force[i] = (goal.position[i] - arm.position[i]) * goal.kp[i] + (
                 -slowing * goal.kd[i]
             )
-            scratch.torque[i] = error[i] * goal.kp[i + 3] + (-turning * goal.kd[i + 3])
-        _, lambda_position, lambda_rotation, nullspace = opspace_matrices(
-            arm.mass, arm.jacobian, arm.jacobian_position, arm.jacobian_rotation
-        )
-        scratch.lambda_position[:] = lambda_position
-        scratch.lambda_rotation[:] = lambda_rotation
-        _numpy_dot(robot.dot, products.force)
-        _numpy_dot(robot.dot, products.torque)
-        _numpy_dot(robot.dot, products.joint_torque)
-        rest = nullspace_torques(
-            arm.mass, nullspace, goal.rest, arm.joint_position, arm.joint_velocity
-        )
+            scratch.torque[i] = scratch.error[i] * goal.kp[i + 3] + (-turning * goal.kd[i + 3])
+        opspace_matrices(space)
+        numpys_product(robot.direct, products.force)
+        numpys_product(robot.direct, products.torque)
+        numpys_product(robot.direct, products.joint_torque)
+        nullspace_torques(space, goal.rest, arm.joint_position, arm.joint_velocity)
         for i in range(n):
-            arm.torque[i] = (scratch.joint_torque[i] + robot.bias[first + i]) + rest[i]
+            arm.torque[i] = (scratch.joint_torque[i] + robot.bias[first + i]) + space.rest[i]
             j = robot.actuator + i
             robot.ctrl[j] = _clipped(arm.torque[i], robot.limits[j, 0], robot.limits[j, 1])
         for i in range(len(robot.fingers)):
             j = robot.fingers[i]
             robot.ctrl[j] = _clipped(goal.fingers[i], robot.limits[j, 0], robot.limits[j, 1])
         if substep == substeps - 1:
-            arm.coordinates[:nq] = robot.qpos
-            arm.coordinates[nq:] = robot.qvel
+            _copy(robot.qpos, 0, arm.coordinates[:nq])
+            _copy(robot.qvel, 0, arm.coordinates[nq:])
         if robot.lite:
             _mj_step2(robot.model, robot.data)
         else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchrl_bmrl.envs import control_period
+from torchrl_bmrl.envs import control_period, operational_space
 from torchrl_bmrl.extras import needs
 
 with needs("robosuite"):
@@ -92,7 +92,7 @@ def settings_obstacle(env: MujocoEnv) -> Obstacle | None:
         return Obstacle("interpolation", "a controller interpolates its goals")
     if not all(robot._enabled_parts.get(part) for part in parts):
         return Obstacle("parts", "a part of the robot is disabled (enable_parts)")
-    if not isinstance(control_period.opspace_matrices, numba.core.dispatcher.Dispatcher):
+    if not isinstance(operational_space.OF_ROBOSUITE[1], numba.core.dispatcher.Dispatcher):
         return Obstacle("numba", "robosuite's macro ENABLE_NUMBA is off")
     return None
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 from torchrl_bmrl.envs.control_period import (
-    DOT,
     Arm,
     Base,
     Goal,
@@ -21,6 +20,7 @@ from torchrl_bmrl.envs.control_period import (
     control_period,
 )
 from torchrl_bmrl.envs.goals import GoalSetter
+from torchrl_bmrl.envs.linear_algebra import NUMPYS_DGEMV, Arguments
 from torchrl_bmrl.envs.obstacles import settings_obstacle, why_not_fast
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.extras import needs
@@ -74,7 +74,7 @@ class FastStepper:
         self._robot = Robot(
             model=model._address,
             data=data._address,
-            dot=id(DOT),
+            direct=bool(NUMPYS_DGEMV),
             lite=bool(env.lite_physics),
             arm_lite=bool(arm.lite_physics),
             site=site,
@@ -107,25 +107,25 @@ class FastStepper:
             jacobian_rotation=arm.J_ori,
             jacobian=arm.J_full,
         )
+        make = self._arguments = Arguments()  # kept alive, like the model and the data
+        space = self._space = make.space(self._arm.mass, arm.J_full, arm.J_pos, arm.J_ori)
         wrench = np.zeros(6)
         scratch = self._scratch = Scratch(
             jacobian_position=np.zeros((3, model.nv)),
             jacobian_rotation=np.zeros((3, model.nv)),
-            lambda_position=np.zeros((3, 3), order="F"),
-            lambda_rotation=np.zeros((3, 3), order="F"),
             force=np.zeros(3),
             torque=np.zeros(3),
+            error=np.zeros(3),
             joint_torque=np.zeros(n),
         )
-        # Kept alive, like the model and the data.
-        self._arguments = {
-            "velocity": (scratch.jacobian_position, data.qvel, arm.ref_pos_vel),
-            "angular_velocity": (scratch.jacobian_rotation, data.qvel, arm.ref_ori_vel),
-            "force": (scratch.lambda_position, scratch.force, wrench[:3]),
-            "torque": (scratch.lambda_rotation, scratch.torque, wrench[3:]),
-            "joint_torque": (arm.J_full.T, wrench, scratch.joint_torque),
-        }
-        self._products = Products(**{name: id(each) for name, each in self._arguments.items()})
+        product = make.numpys_product
+        self._products = Products(
+            velocity=product(scratch.jacobian_position, data.qvel, arm.ref_pos_vel),
+            angular_velocity=product(scratch.jacobian_rotation, data.qvel, arm.ref_ori_vel),
+            force=product(space.position.result, scratch.force, wrench[:3]),
+            torque=product(space.rotation.result, scratch.torque, wrench[3:]),
+            joint_torque=product(arm.J_full.T, wrench, scratch.joint_torque),
+        )
         self._goal_is_local = arm.input_ref_frame == "base"
         self._rotation = np.zeros((3, 3))
         center = model.site(f"{arm.naming_prefix}{arm.part_name}_center").id
@@ -143,14 +143,7 @@ class FastStepper:
             np.zeros((2, 3, model.nv)),
             np.zeros((3, 3)),
         )
-        # Kept alive, like the others.
-        self._base_arguments = (
-            (jacobians[0], data.qvel, velocity),
-            (jacobians[1], data.qvel, angular_velocity),
-            (rotation, self._local_position, offset),
-            (rotation, self._local_rotation, self._rotation),
-        )
-        of_velocity, of_angular_velocity, of_offset, of_rotation = map(id, self._base_arguments)
+        product = self._arguments.numpys_product
         return Base(
             site=site,
             goal_is_local=self._goal_is_local,
@@ -160,10 +153,10 @@ class FastStepper:
             velocity=velocity,
             angular_velocity=angular_velocity,
             goal_offset=offset,
-            velocity_product=of_velocity,
-            angular_velocity_product=of_angular_velocity,
-            goal_offset_product=of_offset,
-            goal_rotation_product=of_rotation,
+            velocity_product=product(jacobians[0], data.qvel, velocity),
+            angular_velocity_product=product(jacobians[1], data.qvel, angular_velocity),
+            goal_offset_product=product(rotation, self._local_position, offset),
+            goal_rotation_product=product(rotation, self._local_rotation, self._rotation),
         )
 
     def serves(self, env: MujocoEnv) -> bool:
@@ -242,6 +235,7 @@ class FastStepper:
             self._robot,
             state,
             self._scratch,
+            self._space,
             self._products,
             self._goal,
             self._base,
