@@ -18,6 +18,7 @@ class Embedded(NamedTuple):
     latent: Tensor  # of each row, (num_tasks, B, m)
     points: Tensor  # that the arranging terms compare: of the rows, or of the sets, likewise
     valid: Tensor | None  # which of the points count
+    alone: Tensor | None = None  # of each row's own transition; None for sets
 
 
 def group_rows(

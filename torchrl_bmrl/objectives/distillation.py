@@ -343,7 +343,7 @@ class MetaDistillationLoss(KeyedLoss):
         valid = self.valid_rows(tensordict, batch)
         task = entry(tensordict, keys.task, valid)
         check_tasks(keys.task, task, batch, valid)
-        m, points, points_valid = self._embed(tensordict)
+        m, points, points_valid, alone = self._embed(tensordict)
         mix = draw_mix(m, valid, self.mixing_fraction) if self.mixing_fraction else None
         own, m = m, m if mix is None else mix.between(m)
         # M receives the gradients of the chosen terms only.
@@ -380,7 +380,7 @@ class MetaDistillationLoss(KeyedLoss):
         for term, error in arranging_errors(self, points, points_valid, batch).items():
             terms[f"loss_{term}"] = getattr(self, f"{term}_weight") * error
         if self.isometry_weight is not None:
-            terms["loss_isometry"] = self.isometry_weight * isometry(self, tensordict)
+            terms["loss_isometry"] = self.isometry_weight * isometry(self, tensordict, alone)
         if self.advantage_weight is not None:
             error = advantage(self, tensordict, value, target_value, reaching["qvalue"], mix)
             terms["loss_advantage"] = self.advantage_weight * error

@@ -273,7 +273,7 @@ class FOCALLoss(OfflineLoss):
         Returns:
             the loss, and no metrics.
         """
-        _, points, valid = self.embed(tensordict)
+        _, points, valid, _ = self.embed(tensordict)
         near, far = draw_pairs(points, valid)
         error = distance_error(points.unsqueeze(2), near.unsqueeze(2), far)
         if valid is None:

@@ -25,12 +25,16 @@ if TYPE_CHECKING:
     from torchrl_bmrl.objectives.distillation import MetaDistillationLoss
 
 
-def isometry(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> Tensor:
+def isometry(
+    loss: MetaDistillationLoss, tensordict: TensorDictBase, alone: Tensor | None
+) -> Tensor:
     """Isometry error of each row's m to the other rows of its task, ``(num_tasks, B)``.
 
     Args:
         loss: the loss.
         tensordict: its data.
+        alone: m of each row's own transition, ``(num_tasks, B, m)``; ``None`` to compute it. A set
+            has no reward and action of its own.
     """
     valid = loss.valid_rows(tensordict, tensordict.batch_size)
     reward = entry(tensordict, next_key(loss.tensor_keys.reward), valid)
@@ -39,8 +43,8 @@ def isometry(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> Tensor:
     with torch.no_grad():
         action = demonstrate(loss, tensordict, centre).get(loss.tensor_keys.action)
     content = torch.cat([reward / loss.reward_scale[:, None, None], action], -1)
-    # Not embed(): a set has no reward and action of its own.
-    return functional.isometry_error(loss._encode(tensordict), content, valid)
+    alone = loss._encode(tensordict) if alone is None else alone
+    return functional.isometry_error(alone, content, valid)
 
 
 def advantage(
@@ -151,18 +155,18 @@ def embedded(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> Embedded
 
 def embed_rows(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> Embedded:
     """m of each row from single transitions."""
-    latent, valid = loss._encode(tensordict), loss.valid_rows(tensordict, tensordict.batch_size)
+    alone, valid = loss._encode(tensordict), loss.valid_rows(tensordict, tensordict.batch_size)
     if loss.context == "current":
-        return Embedded(latent, latent, valid)
+        return Embedded(alone, alone, valid, alone)
     if loss.context == "previous":
         other = encode_previous(loss, tensordict)
     else:
         # The other rows of a task are draws from its data, and so are its context.
         size = loss.context_size if loss.context == "set" else 1
-        other = draw_rows(latent, valid, size).mean(2)
-    chosen = torch.rand(latent.shape[:2], device=latent.device) < loss.context_fraction
-    latent = torch.where(chosen.unsqueeze(-1), other, latent)
-    return Embedded(latent, latent, valid)
+        other = draw_rows(alone, valid, size).mean(2)
+    chosen = torch.rand(alone.shape[:2], device=alone.device) < loss.context_fraction
+    latent = torch.where(chosen.unsqueeze(-1), other, alone)
+    return Embedded(latent, latent, valid, alone)
 
 
 def embed_sets(loss: MetaDistillationLoss, tensordict: TensorDictBase) -> Embedded:
