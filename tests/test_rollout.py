@@ -16,6 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl_bmrl.envs.transforms import make_env
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.evaluation.rollout import evaluate_policy, rollout_episodes
+from torchrl_bmrl.tasks import get_task
 
 pytestmark = pytest.mark.robosuite
 
@@ -49,6 +50,24 @@ def test_outcomes_of_a_batch_are_those_of_one_episode_at_a_time() -> None:
     assert len({outcome.episode_return for outcome in alone}) == 4
     assert all(outcome.success for outcome in alone)
     assert policy.batches == [(2,)] * 80  # one call a step for both
+
+
+@pytest.mark.parametrize("horizon", [7, 10, 23])
+def test_an_evaluation_in_pieces_has_the_outcomes_of_the_whole_episode(
+    horizon: int,
+) -> None:
+    seeds, steps = [5, 1, 8], 25
+    task = get_task("reach").with_options(horizon=horizon)
+    with closing(make_env(task, num_envs=3)) as env:
+        whole = rollout_episodes(env, Towards(0.3), seed=seeds, max_steps=steps)
+        assert whole.batch_size == (3, horizon)
+        returns = whole["next", "reward"].double().sum((1, 2)).tolist()
+        policy, reported = Towards(0.3), []
+        found = evaluate_policy(env, policy, seeds, max_steps=steps, report=reported.append)
+    assert [outcome.episode_return for outcome in found] == returns
+    assert [o.success for o in found] == whole["next", "success"].any(1).flatten().tolist()
+    assert len(policy.batches) == horizon
+    assert sum(reported) == 3 * horizon
 
 
 def test_seeds_decide_what_the_policy_draws_and_nothing_outside_notices() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -71,6 +71,22 @@ def rollout_episodes(
         torch.Size([2, 5])
     """
     seeds = [seed] if isinstance(seed, int) else list(seed)
+    (data,) = _pieces(env, policy, seeds, max_steps, report, length=max_steps)
+    return data
+
+
+def _pieces(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    seeds: list[int],
+    max_steps: int,
+    report: Callable[[int], object] | None,
+    length: int,
+) -> Iterator[TensorDictBase]:
+    """Plays as :func:`rollout_episodes`, and yields the steps in pieces of some length.
+
+    Environments whose episodes end at different steps yield one piece.
+    """
     if len(seeds) != env.numel():
         raise BMRLError(f"{len(seeds)} seeds for {env.numel()} environments; valid: one for each")
     reported = 0
@@ -88,14 +104,31 @@ def rollout_episodes(
             start = env.reset(list_of_kwargs=[{"seed": each} for each in seeds])
             # Episodes end at different steps; a finished one repeats its last observation.
             options = {"break_when_any_done": False, "break_when_all_done": True}
+            length = max_steps
         else:
             start = env.reset(seed=seeds if env.batch_size else seeds[0])
-        data = env.rollout(
-            max_steps, policy, tensordict=start, auto_reset=False, callback=callback, **options
-        )
-    if report is not None:
-        report(data.numel() - reported)  # TorchRL does not call back after the last step
-    return data
+        played = 0
+        while played < max_steps:
+            data = env.rollout(
+                min(length, max_steps - played),
+                policy,
+                tensordict=start,
+                auto_reset=False,
+                callback=callback,
+                **options,
+            )
+            played += data.shape[-1]
+            if report is not None:  # TorchRL does not call back after the last step
+                report(played * len(seeds) - reported)
+                reported = played * len(seeds)
+            yield data
+            if options or data["next", "done"][..., -1, :].any():
+                return
+            start = env.step_mdp(data[..., -1])
+
+
+PIECE = 10
+"""Steps after which an evaluation forgets all but returns and successes."""
 
 
 def evaluate_policy(
@@ -128,10 +161,15 @@ def evaluate_policy(
         [False, False, False, False]
     """
     outcomes, size = [], env.numel()
+    keys = ["reward", "done", "success", "stage"]
     for first in range(0, len(seeds), size):
-        part = seeds[first : first + size]
-        data = rollout_episodes(env, policy, seed=part, max_steps=max_steps, report=report)
-        data = data.reshape(len(part), -1)
+        part = list(seeds[first : first + size])
+        # A whole trajectory of 20 episodes takes hundreds of megabytes.
+        pieces = [
+            piece.select(*(("next", key) for key in keys), strict=False).reshape(len(part), -1)
+            for piece in _pieces(env, policy, part, max_steps, report, PIECE)
+        ]
+        data = torch.cat(pieces, 1)
         after, playing = data.get("next"), still_playing(data)
         returns = (after.get("reward").double().squeeze(-1) * playing).sum(-1).tolist()
         successes: list[bool | None] = [None] * len(part)
