@@ -65,9 +65,9 @@ def evaluate(run: Run) -> str:
         if not set(run.names) <= set(known):
             raise ConfigError(f"tasks is {list(run.names)}; valid for {settings.policy}: {known}")
     if run.playable:
-        policies = [] if alone else [("expert", ""), ("bcq", "")]
-        policies += [("distilled", source) for source in settings.latent_sources]
-        jobs = [(task, *policy) for policy in policies for task in run.names]
+        jobs = [] if alone else jobs_without_student(run)
+        for source in settings.latent_sources:
+            jobs += [(task, "distilled", source) for task in run.names]
         if settings.reference and not alone:
             jobs += [(task.name, "reference", "") for task in run.tasks if task.record is not None]
         rows = run.jobs(
@@ -93,6 +93,15 @@ def evaluate(run: Run) -> str:
     )
     table = (run.folder / "tables" / f"{shown}.md").read_text(encoding="utf-8")
     return f"{table}\nreport: {run.folder / 'report.html'}"
+
+
+def jobs_without_student(run: Run) -> list[tuple[str, str, str]]:
+    """The jobs of :func:`evaluate_job` that need stage 1 only: the experts and the agents.
+
+    Args:
+        run: an open run.
+    """
+    return [(task, policy, "") for policy in ("expert", "bcq") for task in run.names]
 
 
 def evaluate_once(
