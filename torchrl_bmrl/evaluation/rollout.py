@@ -169,7 +169,7 @@ def evaluate_policy(
             piece.select(*(("next", key) for key in keys), strict=False).reshape(len(part), -1)
             for piece in _pieces(env, policy, part, max_steps, report, PIECE)
         ]
-        data = torch.cat(pieces, 1)
+        data: TensorDictBase = torch.cat(pieces, 1)
         after, playing = data.get("next"), still_playing(data)
         returns = (after.get("reward").double().squeeze(-1) * playing).sum(-1).tolist()
         successes: list[bool | None] = [None] * len(part)
