@@ -109,3 +109,21 @@ def test_signals_to_all_processes_leave_the_server_to_its_workers(tmp_path: Path
         "print(json.dumps(os.waitpid(server(), os.WNOHANG)[0] == 0))",
     )
     assert alive
+
+
+@pytest.mark.robosuite
+def test_the_simulator_of_a_task_is_all_that_its_environment_imports(tmp_path: Path) -> None:
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    before, after = run(
+        tmp_path,
+        "import importlib, torchrl_bmrl.pipeline",
+        "from torchrl_bmrl.envs.transforms import make_env",
+        "from torchrl_bmrl.tasks import get_task",
+        "importlib.import_module(get_task('lift').simulator)",
+        "count = lambda: sorted(n for n in sys.modules if n.startswith(('robosuite', 'mujoco')))",
+        "print(json.dumps(count()))",
+        "make_env('lift', num_envs=2).rollout(2)",
+        "print(json.dumps(count()))",
+    )
+    assert before == after
+    assert len(before) > 100

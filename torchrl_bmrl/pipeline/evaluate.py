@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from itertools import cycle
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -27,7 +28,9 @@ from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.stage1 import make_policy
 from torchrl_bmrl.pipeline.student import Student
 from torchrl_bmrl.reports import Embeddings, write_report
+from torchrl_bmrl.reports.drawn import draw_embeddings
 from torchrl_bmrl.reports.films import explore_demonstrations
+from torchrl_bmrl.reports.tables import task_titles
 from torchrl_bmrl.run.folder import read_versions
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.tasks import Task
@@ -64,6 +67,10 @@ def evaluate(run: Run) -> str:
         known = run.student()[1]["tasks"]
         if not set(run.names) <= set(known):
             raise ConfigError(f"tasks is {list(run.names)}; valid for {settings.policy}: {known}")
+    looked = None
+    if not alone and run.settings.distill.task_encoder == "transition":
+        # Beside the episodes, which other processes play. The thread ends with this process.
+        looked = ThreadPool(1).apply_async(look_at_embedding, [run])
     if run.playable:
         jobs = [] if alone else jobs_without_student(run)
         for source in settings.latent_sources:
@@ -81,7 +88,6 @@ def evaluate(run: Run) -> str:
         tables, shown = {}, "results"
     else:
         tables, shown = {"held_out": evaluate_held_out(run)}, "held_out"
-    look = not alone and run.settings.distill.task_encoder == "transition"
     write_report(
         run.folder,
         default_source=settings.latent_sources[0],
@@ -89,7 +95,7 @@ def evaluate(run: Run) -> str:
         titles=run.titles,
         tables=tables,
         seed=run.settings.seed,
-        **(look_at_embedding(run) if look else {}),
+        **(looked.get() if looked else {}),
     )
     table = (run.folder / "tables" / f"{shown}.md").read_text(encoding="utf-8")
     return f"{table}\nreport: {run.folder / 'report.html'}"
@@ -291,10 +297,12 @@ def _success(raw: TensorDictBase) -> np.ndarray:
 def look_at_embedding(run: Run) -> dict[str, Any]:
     """The parts of the report that show the embedding."""
     embeddings, accuracy = embed(run, "valid")
+    training, titles = embed(run, "train")[0], task_titles(run.names, run.titles)
     return {
         "embeddings": embeddings,
-        "training": embed(run, "train")[0],
+        "training": training,
         "accuracy": accuracy,
+        "drawn": draw_embeddings(embeddings, training, titles, seed=run.settings.seed),
         "explorer": explore_demonstrations(run.data_dir, embeddings, titles=run.titles),
     }
 

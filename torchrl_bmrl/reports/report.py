@@ -5,29 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.evaluation.results import Summary, read_results, summarise
 from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.reports import paper
-from torchrl_bmrl.reports.drawing import FEWEST_MAPPED
-from torchrl_bmrl.reports.embedding import (
-    EMBEDDING,
-    Embeddings,
-    measure_goal_distance,
-    measure_stages,
-    name_stages,
-    success_point,
-)
-from torchrl_bmrl.reports.embedding_figures import (
-    embedding_scatter,
-    embedding_stages,
-    embedding_trajectories,
-    embedding_tsne,
-)
+from torchrl_bmrl.reports.drawn import DrawnEmbeddings, draw_embeddings
+from torchrl_bmrl.reports.embedding import Embeddings
 from torchrl_bmrl.reports.explorer import Explorer
-from torchrl_bmrl.reports.page import Picture, Section, write_page
+from torchrl_bmrl.reports.page import Section, write_page
 from torchrl_bmrl.reports.stage1 import (
     diagnostics_table,
     draw_stage1,
@@ -37,9 +22,7 @@ from torchrl_bmrl.reports.stage1 import (
 from torchrl_bmrl.reports.studies import read_studies
 from torchrl_bmrl.reports.tables import (
     Table,
-    goal_distance_table,
     results_table,
-    stages_table,
     task_titles,
 )
 
@@ -55,6 +38,7 @@ def write_report(
     training: Embeddings | None = None,
     accuracy: float | None = None,
     explorer: Explorer | None = None,
+    drawn: DrawnEmbeddings | None = None,
     seed: int = 0,
 ) -> Path:
     """Writes tables, figures and ``report.html`` of a run folder.
@@ -77,6 +61,7 @@ def write_report(
         training: Training transitions, to which stages and success points are fitted.
         accuracy: Held-out accuracy of the task classifier, in [0, 1].
         explorer: Held-out transitions to explore.
+        drawn: Of :func:`draw_embeddings` for the same transitions, if it was called before.
         seed: Seed of t-SNE, of the stages and of the bootstrap.
 
     Returns:
@@ -118,14 +103,14 @@ def write_report(
             "table2": paper.table_2(summaries, titles=titles, default_source=default_source),
         }
     stage1, note1 = draw_stage1(curves, summaries, titles)
-    stage2, note2 = _draw_embeddings(embeddings, training, titles, seed=seed)
-    measures, drawn, note3 = _measure_embeddings(embeddings, training, titles, seed=seed)
+    if drawn is None:
+        drawn = draw_embeddings(embeddings, training, titles, seed=seed)
     agents = {"diagnostics": diagnostics_table(diagnosed)} if diagnosed else {}
 
-    for name, table in {**returns, **agents, **(tables or {}), **measures}.items():
+    for name, table in {**returns, **agents, **(tables or {}), **drawn.tables}.items():
         write_atomic(run_dir / "tables" / f"{name}.md", table.markdown())
         write_atomic(run_dir / "tables" / f"{name}.csv", table.csv())
-    for name, picture in {**stage1, **stage2, **drawn}.items():
+    for name, picture in {**stage1, **drawn.shown, **drawn.measured}.items():
         write_atomic(run_dir / "figures" / f"{name}.png", picture.png)
     sections = [
         Section(
@@ -149,7 +134,11 @@ def write_report(
         heading = "Stage 2: one distilled policy for all tasks"
         sections.append(Section(heading=heading, tables=[returns["table2"]]))
     sections.append(
-        Section(heading="The task embedding", paragraphs=note2, pictures=list(stage2.values()))
+        Section(
+            heading="The task embedding",
+            paragraphs=drawn.shown_notes,
+            pictures=list(drawn.shown.values()),
+        )
     )
     if explorer:
         heading = "Explore the embedding"
@@ -160,9 +149,9 @@ def write_report(
         sections.append(
             Section(
                 heading="Stages and distances in the embedding",
-                paragraphs=note3,
-                tables=list(measures.values()),
-                pictures=list(drawn.values()),
+                paragraphs=drawn.measured_notes,
+                tables=list(drawn.tables.values()),
+                pictures=list(drawn.measured.values()),
             )
         )
     sections += studies
@@ -244,113 +233,3 @@ def _successes(summaries: Sequence[Summary], titles: Mapping[str, str]) -> str:
         f"solved {successes} of {episodes} episodes (least often on {titles[summary.task]}: "
         f"{worst:.0%})"
     )
-
-
-def _draw_embeddings(
-    embeddings: Embeddings | None,
-    training: Embeddings | None,
-    titles: Mapping[str, str],
-    *,
-    seed: int,
-) -> tuple[dict[str, Picture], list[str]]:
-    """Draws the embedding, and notes what is left out."""
-    if embeddings is None:
-        return {}, ["The figures of the embedding are left out: no transition has one of its own."]
-    embeddings = embeddings.in_time()
-    latent, task = embeddings.task_latent, embeddings.task
-    names = [titles[name] for name in embeddings.tasks]
-    pictures = {
-        "embedding": Picture(
-            png=embedding_scatter(latent, task, names),
-            alt="Scatter plot of task embeddings, one colour per task",
-            caption=(
-                "Each point is the embedding m of one transition (state, action, reward, next "
-                "state). Tasks that form separate clusters can be told apart from a single "
-                "transition. Compare the paper's figure 4a."
-            ),
-        ),
-    }
-    mapped = len(task) >= FEWEST_MAPPED
-    notes = [] if mapped else ["The t-SNE map is left out: there are too few transitions."]
-    if mapped:
-        pictures["embedding_tsne"] = Picture(
-            png=embedding_tsne(latent, task, names, seed=seed),
-            alt="t-SNE map of task embeddings, one colour per task",
-            caption=(
-                "The same embeddings after t-SNE, which keeps neighbours together and distorts "
-                "distances: several clusters of one colour suggest stages of that task, such as "
-                "descending, grasping and lifting. Compare the paper's figure 4b."
-            ),
-        )
-    for name in embeddings.tasks:
-        way = embeddings.on_the_way(name)
-        if len(way.task) and not np.isnan(way.distance).any():
-            break
-    else:
-        return pictures, [*notes, "The trajectories are left out: no distance to a goal is known."]
-    center = None if training is None else success_point(training, name)
-    pictures["embedding_trajectories"] = Picture(
-        png=embedding_trajectories(
-            way.task_latent,
-            way.episode,
-            way.distance,
-            title=titles[name],
-            success_point=None if center is None else center[EMBEDDING],
-        ),
-        alt="Lines through the embedding, one per episode, coloured by distance to the goal",
-        caption=(
-            f"{titles[name]}: episodes as lines through the embedding, from circle to star, up to "
-            "their first success. If the embedding contains the progress of the task, the lines "
-            "end in one place and points of one colour lie on a circle around it. The circles are "
-            "centred on the success point of the training demonstrations. Each has the colour of "
-            "a distance to the goal, and the median radius of the transitions at that distance. "
-            "Compare the paper's figure 5 (reach)."
-        ),
-    )
-    return pictures, notes
-
-
-def _measure_embeddings(
-    embeddings: Embeddings | None,
-    training: Embeddings | None,
-    titles: Mapping[str, str],
-    *,
-    seed: int,
-) -> tuple[dict[str, Table], dict[str, Picture], list[str]]:
-    """Measures stages and distances in the embedding, and notes what is left out."""
-    if embeddings is None:
-        return {}, {}, []
-    if training is None:
-        return {}, {}, ["Stages and distances are left out: no training transitions were given."]
-    notes, tables, pictures = [], {}, {}
-    stages = measure_stages(training, embeddings, seed=seed)
-    if stages:
-        tables["stages"] = stages_table(stages, titles=titles)
-    else:
-        notes.append("The stages are left out: no phases of the expert were recorded.")
-    if distances := measure_goal_distance(training, embeddings, seed=seed):
-        tables["goal_distance"] = goal_distance_table(distances, titles=titles)
-    else:
-        notes.append(
-            "The distances are left out: no training demonstration succeeds, or no distance to a "
-            "goal is known."
-        )
-    for task in (result.task for result in stages if result.transitions >= FEWEST_MAPPED):
-        way = embeddings.in_stages(task)
-        pictures["embedding_stages"] = Picture(
-            png=embedding_stages(
-                way.task_latent,
-                way.phase,
-                name_stages(training, embeddings, task, seed=seed)[EMBEDDING],
-                embeddings.phase_names[task],
-                seed=seed,
-            ),
-            alt="Two t-SNE maps of one task's embeddings: by recorded phase, and by group found",
-            caption=(
-                f"{titles[task]}: t-SNE of the embeddings of held-out episodes that succeed, until "
-                "half a second after their first success. Left: by the phase that the expert "
-                "recorded; right: by the group found without it. Compare the paper's figure 4b."
-            ),
-        )
-        break
-    return tables, pictures, notes

@@ -12,13 +12,11 @@ from pathlib import Path
 
 from torchrl_bmrl.run.forked import start_server
 
-os.environ.setdefault(
-    "RL_LOGGING_LEVEL", "WARNING"
-)  # read by torchrl at its import, there and here
-_script = Path(getattr(sys.modules["__main__"], "__file__", None) or "")  # a worker has none
+# torchrl reads this at its import, there and here.
+os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+_script = getattr(sys.modules["__main__"], "__file__", None)  # a worker has none
+_is_recipe = _script is not None and Path(_script).with_name("command.py").exists()
 _given = sys.argv[1:]
-if _script.with_name("command.py").exists() and not any(
-    argument.startswith("-") or argument == "workers=1" for argument in _given
-):
-    _sawyer = not any(argument.startswith("tasks=") for argument in _given)
+if _is_recipe and not any(each.startswith("-") or each == "workers=1" for each in _given):
+    _sawyer = not any(each.startswith("tasks=") for each in _given)
     start_server("torchrl_bmrl.pipeline", *["torchrl_bmrl.envs.vector"] * _sawyer)
