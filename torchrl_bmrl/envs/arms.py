@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_bmrl.envs.physics import kept_environment
+from torchrl_bmrl.envs.rotations import rotation_error
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.extras import needs
 
@@ -72,7 +73,7 @@ def inverse_kinematics(
         current = scratch.site_xmat[site].reshape(3, 3)
         error = np.empty(6)
         error[:3] = target - scratch.site_xpos[site]
-        error[3:] = 0.5 * np.cross(current, orientation, axis=0).sum(axis=1)
+        error[3:] = rotation_error(current, orientation)
         if np.abs(error).max() < tolerance:
             return scratch.qpos[qpos].copy()
         mujoco.mj_jacSite(model, scratch, jacp, jacr, site)

@@ -184,7 +184,7 @@ def _render(task: str, result: str) -> None:
     camera.distance, camera.azimuth, camera.elevation = _DISTANCE, _AZIMUTH, _ELEVATION
     options = mujoco.MjvOption()
     options.geomgroup[0] = 0  # collision shapes
-    known: dict[str, tuple[Any, Any, Any]] = {}
+    known = made = None  # the last scene's: each takes half a gigabyte
     frames = {}
     with np.load(task) as scenes:
         size = int(scenes["size"])
@@ -196,28 +196,57 @@ def _render(task: str, result: str) -> None:
             if marker is not None:
                 marker.set("pos", "1 1 1")  # MuJoCo never moves a site compiled at the origin
             key = ET.tostring(root, encoding="unicode")
-            if key not in known:
-                known[key] = _make_renderer(mujoco, key, size)
-            model, data, renderer = known[key]
+            if key != known:
+                if made is not None:
+                    made[-1].close()
+                known, made = key, None
+                made = _make_renderer(mujoco, key, size)
+            assert made is not None
             if place is not None:
-                model.site(GOAL_MARKER).pos[:] = place
-            pictures = []
-            for state in scenes[f"states{number}"]:
-                data.qpos[:] = state[1 : 1 + model.nq]
-                mujoco.mj_fwdPosition(model, data)  # also places the lights
-                renderer.update_scene(data, camera=camera, scene_option=options)
-                # update_scene resets these flags. On a CPU they take most of the time.
-                for effect in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
-                    renderer.scene.flags[effect] = 0
-                pictures.append(renderer.render())
-                print(flush=True)
+                made[0].site(GOAL_MARKER).pos[:] = place
+            pictures = _pictures(mujoco, made, scenes[f"states{number}"], camera, options)
             frames[f"frames{number}"] = np.array(pictures, np.uint8).reshape(-1, size, size, 3)
     np.savez(result, **frames)
 
 
+def _pictures(
+    mujoco: Any, made: tuple[Any, Any, Any], states: NDArray[Any], camera: Any, options: Any
+) -> list[NDArray[np.uint8]]:
+    model, data, renderer = made
+    pictures = []
+    for state in states:
+        data.qpos[:] = state[1 : 1 + model.nq]
+        mujoco.mj_fwdPosition(model, data)  # also places the lights
+        renderer.update_scene(data, camera=camera, scene_option=options)
+        # update_scene resets these flags. On a CPU they take most of the time.
+        for effect in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            renderer.scene.flags[effect] = 0
+        pictures.append(renderer.render())
+        print(flush=True)
+    return pictures
+
+
+def _compiled(mujoco: Any, text: str) -> Any:
+    """A model, compiled in a process of its own: MuJoCo keeps four times the model's memory."""
+    if not hasattr(os, "fork"):
+        return mujoco.MjModel.from_xml_string(text)
+    with tempfile.TemporaryDirectory() as folder:
+        path = str(Path(folder, "model.mjb"))
+        if (process := os.fork()) == 0:
+            try:
+                mujoco.mj_saveModel(mujoco.MjModel.from_xml_string(text), path)
+            finally:
+                os._exit(0)
+        os.waitpid(process, 0)
+        if Path(path).exists():
+            return mujoco.MjModel.from_binary_path(path)
+    return mujoco.MjModel.from_xml_string(text)  # raises its error here
+
+
 def _make_renderer(mujoco: Any, text: str, size: int) -> tuple[Any, Any, Any]:
-    model = mujoco.MjModel.from_xml_string(text)
+    model = _compiled(mujoco, text)
     model.vis.quality.offsamples = 0  # no antialiasing: a third of the time
+    model.vis.quality.shadowsize = 0  # 64 MB for shadows that are not drawn
     for index in range(model.nsite):
         if model.site(index).name != GOAL_MARKER:
             model.site_rgba[index, 3] = 0.0

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from torchrl_bmrl.envs.rotations import rotation_error
 from torchrl_bmrl.envs.skills import Lift, Push, Reach, Skill
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.run.settings import setting
@@ -114,7 +115,7 @@ class Expert:
         target, gripper, limit = self._target()
         delta = self._gain() * (target - self.env.eef_position) / POSITION_SCALE
         current = self.env.eef_rotation
-        error = 0.5 * np.cross(current, self._rotation, axis=0).sum(axis=1)
+        error = rotation_error(current, self._rotation)
         turn = self.gains.rotation * error / ROTATION_SCALE
         return np.concatenate([self._limited(delta, limit), np.clip(turn, -1, 1), [gripper]])
 
