@@ -265,7 +265,7 @@ def embed(run: Run, split: str) -> tuple[Embeddings, float | None]:
         phase_names |= {task.name: names} if names else {}
     data: TensorDictBase = torch.cat(parts)
     embeddings = Embeddings(
-        task_latent=student.embed(data).numpy(),
+        task_latent=_embed(student, data),
         task=data["task"].numpy(),
         tasks=run.names,
         episode=data["episode"].numpy(),
@@ -276,10 +276,15 @@ def embed(run: Run, split: str) -> tuple[Embeddings, float | None]:
         phase_names=phase_names,
         baselines={
             "raw transition": torch.cat([data[key] for key in TRANSITION_KEYS], -1).numpy(),
-            "untrained encoder": untrained.embed(data).numpy(),
+            "untrained encoder": _embed(untrained, data),
         },
     )
     return embeddings, None if metadata["accuracy"] is None else student.accuracy(data)
+
+
+def _embed(student: Student, data: TensorDictBase) -> np.ndarray:
+    """m of every transition; in parts, since all hidden layers take hundreds of megabytes."""
+    return torch.cat([student.embed(part) for part in data.split(8192)]).numpy()
 
 
 def _distance(raw: TensorDictBase) -> np.ndarray:
@@ -297,13 +302,17 @@ def _success(raw: TensorDictBase) -> np.ndarray:
 def look_at_embedding(run: Run) -> dict[str, Any]:
     """The parts of the report that show the embedding."""
     embeddings, accuracy = embed(run, "valid")
+    # Films are rendered in another process.
+    films = ThreadPool(1).apply_async(
+        explore_demonstrations, [run.data_dir, embeddings], {"titles": run.titles}
+    )
     training, titles = embed(run, "train")[0], task_titles(run.names, run.titles)
     return {
         "embeddings": embeddings,
         "training": training,
         "accuracy": accuracy,
         "drawn": draw_embeddings(embeddings, training, titles, seed=run.settings.seed),
-        "explorer": explore_demonstrations(run.data_dir, embeddings, titles=run.titles),
+        "explorer": films.get(),
     }
 
 
