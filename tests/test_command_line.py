@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import gc
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -192,14 +193,16 @@ def test_every_preset_is_complete_and_valid(recipes: Any, tmp_path: Path, preset
 
 
 def test_the_presets_differ_in_what_their_names_say(recipes: Any, tmp_path: Path) -> None:
-    paper, literal, quick = (
+    paper, literal, long, quick = (
         settings_of(f"preset={preset}", f"run_dir={tmp_path}")
-        for preset in ("paper", "literal", "quick")
+        for preset in ("paper", "literal", "long", "quick")
     )
     assert list(Run(paper).settings.collect.train_episodes.values()) == [500, 500, *[100] * 4]
     assert literal.distill.context_fraction == literal.distill.latent_norm_weight == 0.0
     assert literal.distill.encoder_terms == ["classification"]
-    assert literal.bcq == quick.bcq
+    assert literal.bcq == long.bcq
+    assert long.bcq.epochs * long.bcq.updates_per_epoch == 5000
+    assert replace(long, preset="quick", bcq=quick.bcq, distill=quick.distill) == quick
     assert configured(f"run_dir={tmp_path}") == configured("preset=quick", f"run_dir={tmp_path}")
 
 
@@ -254,14 +257,14 @@ def test_an_ablation_is_valid_and_changes_one_group_of_settings_of_any_preset(
 def test_the_published_stage_1_has_the_settings_of_the_published_presets(
     recipes: Any, tmp_path: Path
 ) -> None:
-    quick, config = (
+    long, config = (
         settings_of(f"preset={preset}", f"ablation={name}", f"run_dir={tmp_path}")
-        for preset, name in (("quick", "none"), ("weak", "published"))
+        for preset, name in (("long", "none"), ("weak", "published"))
     )
     size = {"epochs", "batch_size"}
-    differing = {k for k, x in vars(quick.bcq).items() if x != getattr(config.bcq, k)}
+    differing = {k for k, x in vars(long.bcq).items() if x != getattr(config.bcq, k)}
     assert differing == size
-    assert quick.evaluate.num_candidates == config.evaluate.num_candidates
+    assert long.evaluate.num_candidates == config.evaluate.num_candidates
 
 
 def test_the_settings_of_stage_1_in_the_docs_are_those_of_the_presets(

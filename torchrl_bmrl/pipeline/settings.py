@@ -71,15 +71,15 @@ class BCQSettings:
 
     Example:
         >>> BCQSettings(epochs=2).updates_per_epoch
-        1000
+        600
     """
 
-    epochs: int = setting(5, above=0)  # the agents are evaluated after each
-    updates_per_epoch: int = setting(1000, above=0)  # updates of each network
-    eval_episodes: int = setting(3, at_least=0)  # after each epoch, for the curves; 0: no curves
+    epochs: int = setting(4, above=0)  # the agents are evaluated after each
+    updates_per_epoch: int = setting(600, above=0)  # updates of each network
+    eval_episodes: int = setting(2, at_least=0)  # after each epoch, for the curves; 0: no curves
     batch_size: int = setting(128, above=0)  # transitions per update
     lr: float = setting(1e-3, above=0)  # learning rate of Adam
-    cosine: bool = False  # the learning rate decays to zero
+    cosine: bool = True  # the learning rate decays to zero
     num_cells: list[int] = setting([256, 256], above=0)  # widths of the hidden layers
     generator: str = setting("autoencoder", choices=tuple(GENERATORS))  # model of the actions
     num_qvalue_nets: int = setting(2, above=0)  # critics of each agent
@@ -115,7 +115,7 @@ class DistillSettings:
         'set'
     """
 
-    updates: int = setting(12_000, above=0)  # number of updates
+    updates: int = setting(5000, above=0)  # number of updates
     # Further updates, of an encoder that tells the task from any behaviour (context_episodes).
     inference_updates: int = setting(0, at_least=0)
     # Before these, updates of models of each task's reward, which relabel its contexts; 0: none.
@@ -145,7 +145,7 @@ class DistillSettings:
     contrastive_weight: float = setting(0.0, at_least=0)  # weight of InfoNCE on m
     temperature: float = setting(0.1, above=0)  # temperature of InfoNCE
     isometry_weight: float = setting(1.0, at_least=0)  # weight of the isometry of m
-    advantage_weight: float = setting(0.0, at_least=0)  # weight of differences within a state
+    advantage_weight: float = setting(1.0, at_least=0)  # weight of differences within a state
     normalise_qvalue: bool = True  # with each teacher's mean and deviation
     prototype: str = setting("mean", choices=("mean", "medoid"))  # a task's point of m
 
@@ -220,7 +220,7 @@ class Settings:
         >>> settings = Settings(tasks=["reach", "lift"], bcq=BCQSettings(epochs=2))
         >>> settings.check()
         >>> settings.distill.updates
-        12000
+        5000
     """
 
     preset: str = "quick"  # name of the preset
