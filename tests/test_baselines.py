@@ -131,7 +131,7 @@ def test_an_update_moves_every_network_and_every_target(collected: Path, algorit
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", BASELINES)
 def test_a_policy_comes_to_do_what_the_demonstrator_does(collected: Path, algorithm: str) -> None:
-    learner = make_learner(collected, algorithm, lr=0.003, gamma=0.0)
+    learner = make_learner(collected, algorithm, lr=0.003, gamma=0.0, cosine=False)
     total = {"td3_bc": 600, "rebrac": 600}.get(algorithm, 200)
     step, states = learner.make_step(total), one_action(64, algorithm).select("observation")
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from multiprocessing.forkserver import _forkserver
 from pathlib import Path
 
 import numpy as np
@@ -130,7 +131,9 @@ def test_a_stored_seed_reproduces_its_episode(collected: dict[str, Path]) -> Non
 
 
 @pytest.fixture
-def patch_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+def patch_workers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[[str], None]]:
     """Code that worker processes run when they start, and the processes that they start do not.
 
     Importing TorchRL imports mujoco, whose glfw asks another Python for its version; with the code
@@ -139,12 +142,14 @@ def patch_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[
 
     def patch(code: str) -> None:
         monkeypatch.setenv("PYTHONPATH", str(tmp_path / "patch"), prepend=os.pathsep)
+        _forkserver._stop()  # a new one starts with the code
         (tmp_path / "patch").mkdir()
         (tmp_path / "patch" / "sitecustomize.py").write_text(
             f"import os\nos.environ.pop('PYTHONPATH')\n{code}"
         )
 
-    return patch
+    yield patch
+    _forkserver._stop()
 
 
 def test_two_workers_write_the_same_bytes_as_one(

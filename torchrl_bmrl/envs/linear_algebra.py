@@ -19,6 +19,8 @@ from torchrl_bmrl.envs.caching import cached_njit
 from torchrl_bmrl.extras import needs
 
 with needs("robosuite"):
+    import scipy.linalg.cython_blas
+    import scipy.linalg.cython_lapack  # noqa: F401 (their functions are found by name)
     from llvmlite import binding
     from numba import types
     from numba.extending import get_cython_function_address

@@ -67,9 +67,11 @@ def evaluate(run: Run) -> str:
         known = run.student()[1]["tasks"]
         if not set(run.names) <= set(known):
             raise ConfigError(f"tasks is {list(run.names)}; valid for {settings.policy}: {known}")
+    look = not alone and run.settings.distill.task_encoder == "transition"
     looked = None
-    if not alone and run.settings.distill.task_encoder == "transition":
-        # Beside the episodes, which other processes play. The thread ends with this process.
+    if look and run.playable and run.settings.workers > 1:
+        # Beside the episodes, in a thread that ends with this process. With one worker they are
+        # played here, and both draw from PyTorch's global generator.
         looked = ThreadPool(1).apply_async(look_at_embedding, [run])
     if run.playable:
         jobs = [] if alone else jobs_without_student(run)
@@ -95,7 +97,7 @@ def evaluate(run: Run) -> str:
         titles=run.titles,
         tables=tables,
         seed=run.settings.seed,
-        **(looked.get() if looked else {}),
+        **(looked.get() if looked else look_at_embedding(run) if look else {}),
     )
     table = (run.folder / "tables" / f"{shown}.md").read_text(encoding="utf-8")
     return f"{table}\nreport: {run.folder / 'report.html'}"
@@ -302,11 +304,12 @@ def _success(raw: TensorDictBase) -> np.ndarray:
 def look_at_embedding(run: Run) -> dict[str, Any]:
     """The parts of the report that show the embedding."""
     embeddings, accuracy = embed(run, "valid")
-    # Films are rendered in another process.
+    training, titles = embed(run, "train")[0], task_titles(run.names, run.titles)
+    # Films are rendered in another process. Waiting for it changes PyTorch's number of threads, and
+    # so the last bits of what is computed meanwhile: all embeddings come first.
     films = ThreadPool(1).apply_async(
         explore_demonstrations, [run.data_dir, embeddings], {"titles": run.titles}
     )
-    training, titles = embed(run, "train")[0], task_titles(run.names, run.titles)
     return {
         "embeddings": embeddings,
         "training": training,
