@@ -161,6 +161,24 @@ def test_pictures_follow_states_and_goal() -> None:
     assert len(rows_of(here[0], 1)) == 0  # robosuite's aids are hidden
 
 
+def test_each_scene_is_drawn_from_its_own_model_in_any_order() -> None:
+    from torchrl_bmrl.envs.rendering import render_states
+
+    model = """<mujoco><worldbody><light pos="0 0 3"/><body pos="0 0 1">
+      <joint type="slide" axis="0 0 1"/><geom size="{}" rgba="0 0 1 1" group="1"/>
+      </body></worldbody></mujoco>"""
+    small, large = (model.format(size) for size in (0.1, 0.2))
+    states = np.array([[0.0, 0.0, 0.0], [0.0, 0.3, 0.0]])
+    try:
+        apart = [render_states([(text, states)], size=64)[0] for text in (small, large)]
+        mixed = render_states([(text, states) for text in (small, large, large, small)], size=64)
+    except RenderError as error:
+        skip_without_renderer(error)
+    assert not np.array_equal(*apart)
+    for found, expected in zip(mixed, [apart[0], apart[1], apart[1], apart[0]], strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
 def test_films_are_of_the_first_held_out_episodes(tmp_path: Path) -> None:
     from torchrl_bmrl.reports.films import explore_demonstrations
 

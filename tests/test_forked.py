@@ -70,14 +70,18 @@ def test_workers_have_imported_what_their_server_has_and_an_import_that_fails_st
 def test_a_worker_has_the_environment_of_the_moment_and_handles_its_own_signals(
     tmp_path: Path,
 ) -> None:
-    first, second = run(
+    first, second, third = run(
         tmp_path,
+        'os.environ["SAID"] = "first"',
         "print(json.dumps(run_jobs(before, [0, 1], **OPTIONS)))",
         'os.environ["SAID"] = "later"',
         "print(json.dumps(run_jobs(before, [0, 1], **OPTIONS)))",
+        'del os.environ["SAID"]',
+        "print(json.dumps(run_jobs(before, [0, 1], **OPTIONS)))",
     )
-    assert [each["said"] for each in first + second] == [None, None, "later", "later"]
-    assert all("note" in each["handler"] for each in first + second)
+    said = [each["said"] for each in first + second + third]
+    assert said == ["first", "first", "later", "later", None, None]
+    assert all("note" in each["handler"] for each in first + second + third)
 
 
 def test_workers_do_not_draw_the_same_without_a_seed(tmp_path: Path) -> None:
@@ -109,6 +113,34 @@ def test_signals_to_all_processes_leave_the_server_to_its_workers(tmp_path: Path
         "print(json.dumps(os.waitpid(server(), os.WNOHANG)[0] == 0))",
     )
     assert alive
+
+
+@pytest.mark.parametrize(
+    ("arguments", "beside", "starts"),
+    [
+        ([], "command.py", True),
+        (["preset=smoke", "tasks=[reach]"], "command.py", True),
+        (["--help"], "command.py", False),
+        (["preset=smoke", "workers=1"], "command.py", False),
+        ([], "other.py", False),
+    ],
+)
+def test_a_recipe_starts_its_server_before_it_imports_torch(
+    tmp_path: Path, arguments: list[str], beside: str, starts: bool
+) -> None:
+    (tmp_path / beside).touch()
+    script = tmp_path / "recipe.py"
+    script.write_text(
+        "import json, sys\n"
+        "from multiprocessing import forkserver\n"
+        "import torchrl_bmrl.run.early_server\n"
+        "server = forkserver._forkserver._forkserver_pid\n"
+        "print(json.dumps([server is not None, 'torch' in sys.modules]))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, str(script), *arguments], capture_output=True, text=True, check=True
+    )
+    assert json.loads(done.stdout) == [starts, False]
 
 
 @pytest.mark.robosuite

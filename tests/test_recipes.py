@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -138,6 +140,33 @@ def test_two_workers_give_the_same_bytes_as_one(finished: Path, tmp_path: Path) 
     checkpoints = contents(finished, "**/*.safetensors")
     assert len(checkpoints) == 2 * 3 + 2
     assert contents(tmp_path / "run", "**/*.safetensors") == checkpoints
+
+
+@pytest.mark.parametrize(("workers", "beside"), [(1, False), (2, True)])
+def test_several_workers_evaluate_the_agents_beside_the_student_and_the_embedding_beside_episodes(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int, beside: bool
+) -> None:
+    """One process would draw for both from the same global generator."""
+    stages, evaluation = (
+        importlib.import_module(f"torchrl_bmrl.pipeline.{name}")
+        for name in ("two_stage", "evaluate")
+    )
+    seen: dict[str, bool] = {}
+    evaluate, look = stages.STAGES["evaluate"], evaluation.look_at_embedding
+
+    def evaluated(run: Any) -> str:
+        found = {path.name for path in (run.folder / "evaluation").glob("*")}
+        seen["agents"] = {"reach-bcq.csv", "lift-bcq.csv", "lift-expert.csv"} <= found
+        return evaluate(run)
+
+    def looked(run: Any) -> dict[str, Any]:
+        seen["embedding"] = not (run.folder / "results.csv").exists()
+        return look(run)
+
+    monkeypatch.setitem(stages.STAGES, "evaluate", evaluated)
+    monkeypatch.setattr(evaluation, "look_at_embedding", looked)
+    run(tmp_path / "run", stages.two_stage, f"workers={workers}")
+    assert seen == {"agents": beside, "embedding": beside}
 
 
 def test_a_run_goes_on_with_other_workers_but_not_with_other_settings(

@@ -122,6 +122,20 @@ def test_a_few_steps_of_each_task_equal_robosuites(pairs: Any) -> None:
         assert_same_steps(reference, env, random_actions(env, 3), 10)
 
 
+def test_where_numpys_blas_cannot_be_called_numpy_multiplies(
+    pairs: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchrl_bmrl.envs.stepper.NUMPYS_DGEMV", 0)
+    reference, env = pairs("reach")
+    env._fast = None
+    for one in (reference, env):
+        one.reset(seed=4)
+    assert_same_steps(reference, env, random_actions(env, 4), 10)
+    assert env._fast is not None
+    assert not env._fast._robot.direct
+    env._fast = None  # the others call BLAS
+
+
 def test_fast_and_stock_steps_can_take_turns(pairs: Any) -> None:
     reference, env = pairs("lift")
     for one in (reference, env):

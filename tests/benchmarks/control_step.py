@@ -22,16 +22,16 @@ from torchrl_bmrl.experts.controllers import make_expert
 
 TASKS = ("Reach", "Lift", "PushRight", "PushLeft", "PushUp", "PushDown")
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-STEPS, SUBSTEPS = 100, 25
+STEPS = 100
 
 
-def episode(env: Any) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def episode(env: Any, steps: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Returns actions of a noisy expert, and the states before them."""
     env.reset(seed=0)
-    expert, rng = make_expert(env.unwrapped.robosuite_env), np.random.default_rng(0)
+    expert, rng = make_expert(env.robosuite_env), np.random.default_rng(0)
     actions, states = [], []
-    for _ in range(STEPS):
-        states.append(env.unwrapped.get_state()["physics"])
+    for _ in range(steps):
+        states.append(env.get_state()["physics"])
         actions.append(np.clip(expert() + 0.2 * rng.standard_normal(7), -1, 1))
         env.step(actions[-1])
     return actions, states
@@ -46,19 +46,17 @@ def play(env: Any, actions: list[np.ndarray]) -> float:
     return perf_counter() - start
 
 
-def physics(env: Any, states: list[np.ndarray]) -> float:
-    """Returns the seconds of the substeps alone."""
-    sim = env.unwrapped.robosuite_env.sim
-    model, data = sim.model._model, sim.data._data
-    seconds = 0.0
+def bare(env: Any, states: list[np.ndarray]) -> list[float]:
+    """Returns the seconds of robosuite's physics alone, from each state."""
+    model, data = env.sim.model._model, env.sim.data._data
+    substeps, seconds = int(0.05 / model.opt.timestep), []
     for state in states:
         mujoco.mj_setState(model, data, state, STATE)
-        mujoco.mj_forward(model, data)
         start = perf_counter()
-        for _ in range(SUBSTEPS):
+        for _ in range(substeps):
             mujoco.mj_step1(model, data)
             mujoco.mj_step2(model, data)
-        seconds += perf_counter() - start
+        seconds.append(perf_counter() - start)
     return seconds
 
 
@@ -69,8 +67,8 @@ def main() -> None:
     rounds = parser.parse_args().rounds
     for task in TASKS:
         env = gymnasium.make(f"bmrl/Sawyer{task}-v0").unwrapped
-        actions, states = episode(env)
-        times = [(play(env, actions), physics(env, states)) for _ in range(rounds)]
+        actions, states = episode(env, STEPS)
+        times = [(play(env, actions), sum(bare(env.robosuite_env, states))) for _ in range(rounds)]
         step, bare = (min(column) / STEPS * 1000 for column in zip(*times, strict=True))
         print(f"{task} {step:.3f} {bare / step:.3f}", flush=True)
         env.close()

@@ -34,6 +34,7 @@ import mujoco
 import numpy as np
 import robosuite
 import torch
+from control_step import STATE, bare, episode, play
 
 from torchrl_bmrl.envs.acceleration import accelerate_robosuite
 from torchrl_bmrl.envs.skills import SKILLS
@@ -41,12 +42,10 @@ from torchrl_bmrl.envs.tabletop import STEPPERS, TabletopEnv
 from torchrl_bmrl.envs.transforms import make_env
 from torchrl_bmrl.evaluation.rollout import evaluate_policy
 from torchrl_bmrl.experts.collect import collect_demonstrations
-from torchrl_bmrl.experts.controllers import make_expert
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.pipeline.agents import make_bcq_loss
 from torchrl_bmrl.tasks import get_task
 
-STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 STOCK = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "Wipe")
 ARMS = ("Panda", "Sawyer", "UR5e")
 
@@ -129,40 +128,6 @@ def play_stock(env: Any, steps: int) -> Played:
             played.outcome.extend(np.asarray(array).tobytes() for array in arrays)
             played.outcome.append(repr((done, info)).encode())
     return played
-
-
-def episode(env: TabletopEnv, steps: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Returns actions of a noisy expert and the states before them."""
-    env.reset(seed=0)
-    expert, rng = make_expert(env.robosuite_env), np.random.default_rng(0)
-    actions, states = [], []
-    for _ in range(steps):
-        states.append(env.get_state()["physics"])
-        actions.append(np.clip(expert() + 0.2 * rng.standard_normal(7), -1, 1))
-        env.step(actions[-1])
-    return actions, states
-
-
-def play(env: TabletopEnv, actions: list[np.ndarray]) -> float:
-    """Returns the time of an episode's steps."""
-    env.reset(seed=0)
-    return sum(seconds(lambda: env.step(action)) for action in actions)  # noqa: B023
-
-
-def bare(env: Any, states: list[np.ndarray]) -> list[float]:
-    """Returns the times of robosuite's physics alone, from the same states."""
-    model, data = env.sim.model._model, env.sim.data._data
-    substeps, times = int(0.05 / model.opt.timestep), []
-
-    def advance() -> None:
-        for _ in range(substeps):
-            mujoco.mj_step1(model, data)
-            mujoco.mj_step2(model, data)
-
-    for state in states:
-        mujoco.mj_setState(model, data, state, STATE)
-        times.append(seconds(advance))
-    return times
 
 
 def step_table(rounds: int, steps: int = 200) -> None:

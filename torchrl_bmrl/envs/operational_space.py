@@ -2,8 +2,8 @@
 
 Each is robosuite's own function, written without the allocations and checks that take numba seconds
 to compile and longer to run than the calculation. The operations, their order and the routines are
-the same. Where robosuite's function is another one than this module knows (it was replaced, or is
-of another version), the loop calls robosuite's.
+the same. Where one of robosuite's functions is another one than this module knows (it was replaced,
+or is of another version), the loop calls robosuite's.
 """
 
 from __future__ import annotations
@@ -23,11 +23,15 @@ from torchrl_bmrl.extras import needs
 with needs("robosuite"):
     from robosuite.utils import control_utils
 
-_error = control_utils.orientation_error
-_matrices = control_utils.opspace_matrices
-_torques = control_utils.nullspace_torques
-OF_ROBOSUITE = (_error, _matrices, _torques)
+OF_ROBOSUITE = (
+    control_utils.orientation_error,
+    control_utils.opspace_matrices,
+    control_utils.nullspace_torques,
+)
 """robosuite's functions."""
+KNOWN = ("629a54f547a55298", "7fa718e5be3ac65a", "c960d5990b00d44f")
+"""Their :func:`definition` in robosuite 1.5.2."""
+_error, _matrices, _torques = OF_ROBOSUITE
 _CODE = (tokenize.NAME, tokenize.NUMBER, tokenize.OP)
 
 
@@ -46,7 +50,7 @@ def definition(function: Any) -> str:
     return hashlib.sha256(" ".join(words).encode()).hexdigest()[:16]
 
 
-if definition(_error) == "629a54f547a55298":
+if tuple(map(definition, OF_ROBOSUITE)) == KNOWN:
 
     @cached_njit
     def orientation_error(desired: np.ndarray, current: np.ndarray, error: np.ndarray) -> None:
@@ -61,37 +65,7 @@ if definition(_error) == "629a54f547a55298":
                 + (current[j, 2] * desired[k, 2] - current[k, 2] * desired[j, 2])
             )
 
-else:
-
-    @cached_njit
-    def orientation_error(desired: np.ndarray, current: np.ndarray, error: np.ndarray) -> None:
-        """As robosuite's, into ``error``."""
-        found = _error(desired, current)
-        for i in range(3):
-            error[i] = found[i]
-
-
-if definition(_matrices) == "7fa718e5be3ac65a":
-
-    @cached_njit
-    def opspace_matrices(space: Space) -> None:
-        """Inverses and null space, into the space."""
-        invert_space(space)
-
-else:
-
-    @cached_njit
-    def opspace_matrices(space: Space) -> None:
-        """As robosuite's, into the space."""
-        _, position, rotation, nullspace = _matrices(
-            space.mass, space.jacobian, space.jacobian_position, space.jacobian_rotation
-        )
-        space.position.result[:] = position
-        space.rotation.result[:] = rotation
-        space.nullspace[:] = nullspace
-
-
-if definition(_torques) == "c960d5990b00d44f":
+    opspace_matrices = invert_space
 
     @cached_njit
     def nullspace_torques(
@@ -105,6 +79,21 @@ if definition(_torques) == "c960d5990b00d44f":
         move(space.to_rest)
 
 else:
+
+    @cached_njit
+    def orientation_error(desired: np.ndarray, current: np.ndarray, error: np.ndarray) -> None:
+        """As robosuite's, into ``error``."""
+        error[:] = _error(desired, current)
+
+    @cached_njit
+    def opspace_matrices(space: Space) -> None:
+        """As robosuite's, into the space."""
+        _, position, rotation, nullspace = _matrices(
+            space.mass, space.jacobian, space.jacobian_position, space.jacobian_rotation
+        )
+        space.position.result[:] = position
+        space.rotation.result[:] = rotation
+        space.nullspace[:] = nullspace
 
     @cached_njit
     def nullspace_torques(

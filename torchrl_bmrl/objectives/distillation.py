@@ -380,6 +380,7 @@ class MetaDistillationLoss(KeyedLoss):
         for term, error in arranging_errors(self, points, points_valid, batch).items():
             terms[f"loss_{term}"] = getattr(self, f"{term}_weight") * error
         if self.isometry_weight is not None:
+            assert alone is not None  # the term is refused with encoders of sets
             terms["loss_isometry"] = self.isometry_weight * isometry(self, tensordict, alone)
         if self.advantage_weight is not None:
             error = advantage(self, tensordict, value, target_value, reaching["qvalue"], mix)

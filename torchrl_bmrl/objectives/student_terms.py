@@ -25,16 +25,14 @@ if TYPE_CHECKING:
     from torchrl_bmrl.objectives.distillation import MetaDistillationLoss
 
 
-def isometry(
-    loss: MetaDistillationLoss, tensordict: TensorDictBase, alone: Tensor | None
-) -> Tensor:
+def isometry(loss: MetaDistillationLoss, tensordict: TensorDictBase, alone: Tensor) -> Tensor:
     """Isometry error of each row's m to the other rows of its task, ``(num_tasks, B)``.
 
     Args:
         loss: the loss.
         tensordict: its data.
-        alone: m of each row's own transition, ``(num_tasks, B, m)``; ``None`` to compute it. A set
-            has no reward and action of its own.
+        alone: m of each row's own transition, ``(num_tasks, B, m)``: a set has no reward and action
+            of its own.
     """
     valid = loss.valid_rows(tensordict, tensordict.batch_size)
     reward = entry(tensordict, next_key(loss.tensor_keys.reward), valid)
@@ -43,7 +41,6 @@ def isometry(
     with torch.no_grad():
         action = demonstrate(loss, tensordict, centre).get(loss.tensor_keys.action)
     content = torch.cat([reward / loss.reward_scale[:, None, None], action], -1)
-    alone = loss._encode(tensordict) if alone is None else alone
     return functional.isometry_error(alone, content, valid)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import dataclass
@@ -56,11 +56,13 @@ OF_THE_TRAINING = (
 )
 
 
-def stage2(run: Run) -> None:
+def stage2(run: Run, *, beside: Sequence[tuple[Callable[..., Any], Any]] = ()) -> None:
     """Trains the student of the run's agents, or resumes from its checkpoint.
 
     Args:
         run: an open run, with the agents of every task.
+        beside: ``(function, job)``, work for the run's other workers, which call
+            ``function((run, job), report)``; the student is trained in a worker, too, then.
 
     Raises:
         ConfigError: for agents that propose chunks of actions.
@@ -75,13 +77,19 @@ def stage2(run: Run) -> None:
     """
     run.check_single_actions("the distillation")
     run.jobs(
-        train_student,
-        [StudentJob(run.settings.distill, "distill")],
-        workers=1,
+        _call,
+        [(train_student, StudentJob(run.settings.distill, "distill")), *beside],
+        workers=None if beside else 1,
         total=all_updates(run.settings.distill),
         description="stage 2: distilling",
         unit="update",
     )
+
+
+def _call(job: tuple[Run, tuple[Callable[..., Any], Any]], report: Report) -> None:
+    run, (function, of_it) = job
+    # The progress is the student's; the others only say that they go on.
+    function((run, of_it), report if function is train_student else lambda units: report(0))
 
 
 def value_statistics(

@@ -5,40 +5,22 @@ from __future__ import annotations
 import json
 import logging
 import time
-from typing import Any
 
 from torchrl_bmrl.files import read_json, write_atomic
 from torchrl_bmrl.pipeline.collect import collect
 from torchrl_bmrl.pipeline.evaluate import evaluate, evaluate_job, jobs_without_student
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.stage1 import stage1
-from torchrl_bmrl.pipeline.stage2 import StudentJob, all_updates, stage2, train_student
-from torchrl_bmrl.run.workers import Report
+from torchrl_bmrl.pipeline.stage2 import stage2
 
 log = logging.getLogger(__name__)
 
 
 def _stage2(run: Run) -> None:
     """Trains the student in one worker, while the others play the agents' evaluation."""
-    if run.settings.workers == 1 or not run.playable or run.settings.evaluate.policy:
-        stage2(run)
-        return
-    student: list[Any] = [StudentJob(run.settings.distill, "distill")]
-    run.jobs(
-        _train_or_evaluate,
-        student + jobs_without_student(run),
-        total=all_updates(run.settings.distill),
-        description="stage 2: distilling",
-        unit="update",
-    )
-
-
-def _train_or_evaluate(job: tuple[Run, StudentJob | tuple[str, str, str]], report: Report) -> None:
-    run, part = job
-    if isinstance(part, StudentJob):
-        train_student((run, part), report)
-    else:
-        evaluate_job((run, part), lambda steps: report(0))  # the progress is the student's
+    plays = run.settings.workers > 1 and run.playable and run.settings.evaluate.policy is None
+    jobs = jobs_without_student(run) if plays else []
+    stage2(run, beside=[(evaluate_job, job) for job in jobs])
 
 
 STAGES = {"collect": collect, "stage 1": stage1, "stage 2": _stage2, "evaluate": evaluate}

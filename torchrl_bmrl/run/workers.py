@@ -175,7 +175,8 @@ def _serve(
     environment: dict[str, str],
 ) -> None:
     """Main loop of a worker: receives jobs, sends reports and results."""
-    os.environ.update(environment)  # a forked worker has that of its server
+    os.environ.clear()  # a forked worker has that of its server
+    os.environ.update(environment)
     if (numpy := sys.modules.get("numpy")) is not None:
         numpy.random.seed()  # and the random state: without a seed, all would draw the same
     LOGGER.setLevel(level)
