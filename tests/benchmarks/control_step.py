@@ -69,8 +69,8 @@ def main() -> None:
         env = gymnasium.make(f"bmrl/Sawyer{task}-v0").unwrapped
         actions, states = episode(env, STEPS)
         times = [(play(env, actions), sum(bare(env.robosuite_env, states))) for _ in range(rounds)]
-        step, bare = (min(column) / STEPS * 1000 for column in zip(*times, strict=True))
-        print(f"{task} {step:.3f} {bare / step:.3f}", flush=True)
+        step, alone = (min(column) / STEPS * 1000 for column in zip(*times, strict=True))
+        print(f"{task} {step:.3f} {alone / step:.3f}", flush=True)
         env.close()
 
 
