@@ -8,7 +8,8 @@ import os
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import NoReturn
+from types import SimpleNamespace
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from explorers import TASKS
 from PIL import Image
 
 from torchrl_bmrl.errors import BMRLError, DataError, RenderError
+from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.reports import Embeddings
 
 
@@ -64,9 +66,11 @@ def write_demonstrations(folder: Path, *, states: bool = True) -> Embeddings:
 
 
 def test_phases_and_successes_are_those_of_the_file(tmp_path: Path) -> None:
-    from torchrl_bmrl.reports.films import explore_demonstrations
+    from torchrl_bmrl.reports.films import explore_demonstrations, film_demonstrations
 
-    explorer = explore_demonstrations(tmp_path, write_demonstrations(tmp_path, states=False))
+    embeddings = write_demonstrations(tmp_path, states=False)
+    films = film_demonstrations(tmp_path, ["lift"])
+    explorer = explore_demonstrations(tmp_path, embeddings, films)
     assert explorer.phase == ["down"] * 3 + ["up"] * 3 + ["down"] * 3 + ["up"] * 3 + [
         *["down"] * 3,
         *["up"] * 3,
@@ -77,27 +81,82 @@ def test_phases_and_successes_are_those_of_the_file(tmp_path: Path) -> None:
 
 
 def test_transitions_that_the_file_does_not_hold_are_refused(tmp_path: Path) -> None:
-    from torchrl_bmrl.reports.films import explore_demonstrations
+    from torchrl_bmrl.reports.films import Films, explore_demonstrations
 
     embeddings = write_demonstrations(tmp_path)
+    others = replace(embeddings, episode=embeddings.episode + 9)
     with pytest.raises(DataError, match=r"lift\.hdf5.*no episode 9"):
-        explore_demonstrations(tmp_path, replace(embeddings, episode=embeddings.episode + 9))
+        explore_demonstrations(tmp_path, others, Films())
     with pytest.raises(DataError, match=r"lift\.hdf5.*no step 12"):
-        explore_demonstrations(tmp_path, replace(embeddings, step=embeddings.step + 7))
+        explore_demonstrations(tmp_path, replace(embeddings, step=embeddings.step + 7), Films())
+
+
+class OneTask(SimpleNamespace):
+    """What :func:`films_of` reads of a run of lift."""
+
+    once = Run.once
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder=folder, data_dir=folder, names=("lift",))
 
 
 @pytest.mark.parametrize("library", ["disabled", "no-such-library"])
 def test_without_a_renderer_the_rest_is_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str
 ) -> None:
+    from torchrl_bmrl.pipeline.evaluate import films_of
     from torchrl_bmrl.reports.films import explore_demonstrations
 
     monkeypatch.setenv("MUJOCO_GL", library)
-    explorer = explore_demonstrations(tmp_path, write_demonstrations(tmp_path))
+    embeddings = write_demonstrations(tmp_path)
+    explorer = explore_demonstrations(tmp_path, embeddings, films_of(OneTask(tmp_path)))
     assert not explorer.frames
     assert explorer.phase[0] == "down"
     assert "There are no films: no pictures can be rendered here" in explorer.paragraphs()[-1]
     assert library in explorer.paragraphs()[-1]
+    assert not (tmp_path / "evaluation").exists()  # so another machine can still make them
+
+
+def test_films_are_rendered_once_and_read_from_their_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from torchrl_bmrl.pipeline.evaluate import films_of
+    from torchrl_bmrl.reports import films
+
+    def render(scenes: list[Any], report: Any) -> list[np.ndarray]:
+        drawn.append([len(states) for _, states in scenes])
+        report(1)
+        return [np.full((len(states), 16, 16, 3), 90, np.uint8) for _, states in scenes]
+
+    drawn: list[list[int]] = []
+    made: list[int] = []
+    monkeypatch.setattr(films, "render_states", render)
+    write_demonstrations(tmp_path)
+    first = films_of(OneTask(tmp_path), made.append)
+    assert (drawn, made) == ([[2, 2]], [1])
+    assert set(first.frames) == {(0, number, step) for number in (0, 1) for step in (0, 5)}
+    assert films_of(OneTask(tmp_path)) == first
+    assert len(drawn) == 1
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "[]",
+        '{"frames": {}}',
+        '{"frames": {"0 1": "AAAA"}, "note": ""}',
+        '{"frames": {"0 1 x": "AAAA"}, "note": ""}',
+        '{"frames": {"0 1 2": "%%"}, "note": ""}',
+        '{"frames": {"0 1 2": 3}, "note": ""}',
+    ],
+)
+def test_a_damaged_file_of_films_is_refused_by_name(tmp_path: Path, content: str) -> None:
+    from torchrl_bmrl.reports.films import read_films
+
+    path = tmp_path / "films.json"
+    path.write_text(content)
+    with pytest.raises(DataError, match=r"films\.json: not films .*; remove it"):
+        read_films(path)
 
 
 def test_a_library_that_kills_its_process_is_only_reported(
@@ -180,11 +239,19 @@ def test_each_scene_is_drawn_from_its_own_model_in_any_order() -> None:
 
 
 def test_films_are_of_the_first_held_out_episodes(tmp_path: Path) -> None:
-    from torchrl_bmrl.reports.films import explore_demonstrations
+    from torchrl_bmrl.reports.films import explore_demonstrations, film_demonstrations
 
-    explorer = explore_demonstrations(tmp_path, write_demonstrations(tmp_path))
-    if not explorer.frames:
-        skip_without_renderer(RenderError([explorer.note]))
+    embeddings = write_demonstrations(tmp_path)
+    others = tmp_path / "others"
+    write_demonstrations(others, states=False)
+    for task in TASKS:
+        if task != "lift":
+            (tmp_path / f"{task}.hdf5").symlink_to(others / "lift.hdf5")
+    try:
+        films = film_demonstrations(tmp_path, TASKS)
+    except RenderError as error:
+        skip_without_renderer(error)
+    explorer = explore_demonstrations(tmp_path, embeddings, films)
     lift = TASKS.index("lift")
     assert set(explorer.frames) == {(lift, number, step) for number in (0, 1) for step in (0, 5)}
     picture = Image.open(io.BytesIO(explorer.frames[lift, 0, 0]))

@@ -104,7 +104,7 @@ def test_the_explorer_has_the_runs_titles(tmp_path: Path) -> None:
     pytest.importorskip("tqdm")
     from torchrl_bmrl.data import Episode, robomimic
     from torchrl_bmrl.reports import Embeddings
-    from torchrl_bmrl.reports.films import explore_demonstrations
+    from torchrl_bmrl.reports.films import Films, explore_demonstrations
 
     parts, zeros = {"x": np.zeros((5, 3))}, np.zeros(1, dtype=int)
     episode = Episode(
@@ -119,7 +119,7 @@ def test_the_explorer_has_the_runs_titles(tmp_path: Path) -> None:
     embeddings = Embeddings(
         tasks=["pour"], task_latent=np.zeros((1, 2)), task=zeros, episode=zeros, step=zeros
     )
-    explorer = explore_demonstrations(tmp_path, embeddings, titles=TITLES)
+    explorer = explore_demonstrations(tmp_path, embeddings, Films(), titles=TITLES)
     assert explorer.titles == ["Pouring water"]
 
 

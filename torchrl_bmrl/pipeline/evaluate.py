@@ -18,7 +18,7 @@ from torchrl.envs.transforms import Transform
 from torchrl_bmrl.data.demonstrations import has_contexts, read_demonstrations, read_phases
 from torchrl_bmrl.data.robomimic_file import MASKS
 from torchrl_bmrl.envs.transforms import ObservationStatistics
-from torchrl_bmrl.errors import ConfigError
+from torchrl_bmrl.errors import ConfigError, RenderError
 from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
 from torchrl_bmrl.experts.settings import ExpertSettings
@@ -29,7 +29,13 @@ from torchrl_bmrl.pipeline.stage1 import make_policy
 from torchrl_bmrl.pipeline.student import Student
 from torchrl_bmrl.reports import Embeddings, write_report
 from torchrl_bmrl.reports.drawn import draw_embeddings
-from torchrl_bmrl.reports.films import explore_demonstrations
+from torchrl_bmrl.reports.films import (
+    Films,
+    explore_demonstrations,
+    film_demonstrations,
+    read_films,
+    write_films,
+)
 from torchrl_bmrl.reports.tables import task_titles
 from torchrl_bmrl.run.folder import read_versions
 from torchrl_bmrl.run.workers import Report
@@ -67,7 +73,7 @@ def evaluate(run: Run) -> str:
         known = run.student()[1]["tasks"]
         if not set(run.names) <= set(known):
             raise ConfigError(f"tasks is {list(run.names)}; valid for {settings.policy}: {known}")
-    look = not alone and run.settings.distill.task_encoder == "transition"
+    look = not alone and shows_embedding(run)
     looked = None
     if look and run.playable and run.settings.workers > 1:
         # Beside the episodes, in a thread that ends with this process. With one worker they are
@@ -110,6 +116,33 @@ def jobs_without_student(run: Run) -> list[tuple[str, str, str]]:
         run: an open run.
     """
     return [(task, policy, "") for policy in ("expert", "bcq") for task in run.names]
+
+
+def shows_embedding(run: Run) -> bool:
+    """Whether each transition has an embedding of its own, which the report then shows."""
+    return run.settings.distill.task_encoder == "transition"
+
+
+def films_of(run: Run, report: Report | None = None) -> Films:
+    """Films of the held-out demonstrations, ``evaluation/films.json``, which are rendered once.
+
+    Args:
+        run: an open run with demonstrations.
+        report: called with the number of new pictures; ``None`` shows a progress bar.
+    """
+
+    def make(path: Path) -> None:
+        write_films(path, film_demonstrations(run.data_dir, run.names, report=report))
+
+    try:
+        return run.once("evaluation/films.json", read_films, make)
+    except RenderError as error:
+        return Films(note=f"{error}.")
+
+
+def film_job(job: tuple[Run, None], report: Report) -> None:
+    """Renders the films, for the evaluation."""
+    films_of(job[0], report)
 
 
 def evaluate_once(
@@ -307,15 +340,15 @@ def look_at_embedding(run: Run) -> dict[str, Any]:
     training, titles = embed(run, "train")[0], task_titles(run.names, run.titles)
     # Films are rendered in another process. Waiting for it changes PyTorch's number of threads, and
     # so the last bits of what is computed meanwhile: all embeddings come first.
-    films = ThreadPool(1).apply_async(
-        explore_demonstrations, [run.data_dir, embeddings], {"titles": run.titles}
-    )
+    films = ThreadPool(1).apply_async(films_of, [run])
     return {
         "embeddings": embeddings,
         "training": training,
         "accuracy": accuracy,
         "drawn": draw_embeddings(embeddings, training, titles, seed=run.settings.seed),
-        "explorer": films.get(),
+        "explorer": explore_demonstrations(
+            run.data_dir, embeddings, films.get(), titles=run.titles
+        ),
     }
 
 

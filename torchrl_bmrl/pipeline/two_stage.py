@@ -5,10 +5,18 @@ from __future__ import annotations
 import json
 import logging
 import time
+from collections.abc import Callable
+from typing import Any
 
 from torchrl_bmrl.files import read_json, write_atomic
 from torchrl_bmrl.pipeline.collect import collect
-from torchrl_bmrl.pipeline.evaluate import evaluate, evaluate_job, jobs_without_student
+from torchrl_bmrl.pipeline.evaluate import (
+    evaluate,
+    evaluate_job,
+    film_job,
+    jobs_without_student,
+    shows_embedding,
+)
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.stage1 import stage1
 from torchrl_bmrl.pipeline.stage2 import stage2
@@ -17,10 +25,13 @@ log = logging.getLogger(__name__)
 
 
 def _stage2(run: Run) -> None:
-    """Trains the student in one worker, while the others play the agents' evaluation."""
+    """Trains the student in one worker; the others play the agents' episodes and make films."""
     plays = run.settings.workers > 1 and run.playable and run.settings.evaluate.policy is None
-    jobs = jobs_without_student(run) if plays else []
-    stage2(run, beside=[(evaluate_job, job) for job in jobs])
+    beside: list[tuple[Callable[..., Any], Any]] = []
+    if plays:
+        beside += [(evaluate_job, job) for job in jobs_without_student(run)]
+        beside += [(film_job, None)] if shows_embedding(run) else []
+    stage2(run, beside=beside)
 
 
 STAGES = {"collect": collect, "stage 1": stage1, "stage 2": _stage2, "evaluate": evaluate}
@@ -30,7 +41,7 @@ def two_stage(run: Run) -> str:
     """Collects demonstrations, trains both stages, evaluates, and writes the report.
 
     Each stage skips what an earlier call finished. With several workers the agents are evaluated
-    while the student is trained.
+    and the report's films are rendered while the student is trained.
 
     Args:
         run: an open run.

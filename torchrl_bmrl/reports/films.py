@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import base64
+import binascii
 import io
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +19,9 @@ from torchrl_bmrl.data.robomimic import open_episodes
 from torchrl_bmrl.data.robomimic_file import read_metadata
 from torchrl_bmrl.data.sources import Source
 from torchrl_bmrl.envs.rendering import render_states
-from torchrl_bmrl.errors import DataError, RenderError
+from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.extras import needs
+from torchrl_bmrl.files import read_json, write_atomic
 from torchrl_bmrl.reports.embedding import Embeddings
 from torchrl_bmrl.reports.explorer import Explorer, Moment
 from torchrl_bmrl.reports.tables import task_titles
@@ -28,18 +33,106 @@ EVERY = 5
 """Steps from one picture to the next."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Films:
+    """Pictures of held-out demonstrations.
+
+    Args:
+        frames: WebP pictures by class index, episode and step.
+        note: Why there are none.
+
+    Example:
+        >>> Films(note="egl: none.").frames
+        {}
+    """
+
+    frames: Mapping[Moment, bytes] = field(default_factory=dict)
+    note: str = ""
+
+
+def film_demonstrations(
+    data_dir: Path, tasks: Sequence[str], *, report: Report | None = None
+) -> Films:
+    """Renders every fifth step of each task's first two held-out demonstrations.
+
+    Args:
+        data_dir: Folder of the demonstrations, ``<task>.hdf5``.
+        tasks: Names of the tasks; a task's position is its class index.
+        report: Called with the number of new pictures; ``None`` shows a progress bar.
+
+    Raises:
+        DataError: if a file is missing or damaged.
+        RenderError: if no graphics library works.
+
+    Example:
+        >>> film_demonstrations(Path("nowhere"), ["reach"])
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.DataError: nowhere/reach.hdf5: no such file
+    """
+    moments: list[Moment] = []
+    scenes: list[tuple[str, NDArray[Any]]] = []
+    for task, name in enumerate(tasks):
+        path = demonstration_path(data_dir, name)
+        with open_episodes(
+            path, split="valid", observation_keys=(), extras=("states",)
+        ) as episodes:
+            for number, key in enumerate(list(episodes)[:FILMS]):
+                episode = episodes[key]
+                if "states" in episode.extras and "model_file" in episode.attributes:
+                    states = episode.extras["states"][: len(episode) : EVERY]
+                    moments += [(task, number, EVERY * i) for i in range(len(states))]
+                    scenes.append((episode.attributes["model_file"], states))
+    if not scenes:
+        return Films(note="the demonstrations contain no simulator states.")
+    pictures = _render(scenes) if report is None else render_states(scenes, report=report)
+    frames = [webp(picture) for episode in pictures for picture in episode]
+    return Films(frames=dict(zip(moments, frames, strict=True)))
+
+
+def write_films(path: Path, films: Films) -> None:
+    """Writes films to a file, or leaves the old one."""
+    frames = {
+        " ".join(map(str, moment)): base64.b64encode(frame).decode("ascii")
+        for moment, frame in films.frames.items()
+    }
+    content = {"frames": frames, "note": films.note}
+    write_atomic(path, json.dumps(content, allow_nan=False) + "\n")
+
+
+def read_films(path: Path) -> Films:
+    """Reads films.
+
+    Raises:
+        DataError: if the file is missing or damaged.
+    """
+    content = read_json(path, "films; remove it")
+    frames: dict[Moment, bytes] = {}
+    try:
+        for moment, frame in content["frames"].items():
+            task, episode, step = map(int, moment.split())
+            frames[task, episode, step] = base64.b64decode(frame, validate=True)
+        return Films(frames=frames, note=str(content["note"]))
+    except (KeyError, ValueError, TypeError, AttributeError, binascii.Error) as error:
+        raise DataError(path, None, f"not films ({error}); remove it") from error
+
+
 def explore_demonstrations(
-    data_dir: Path, embeddings: Embeddings, *, titles: Mapping[str, str] | None = None
+    data_dir: Path,
+    embeddings: Embeddings,
+    films: Films,
+    *,
+    titles: Mapping[str, str] | None = None,
 ) -> Explorer:
     """Makes an explorer of held-out demonstrations, with phases, successes and films.
 
-    Phases and successes are left out if they were not recorded. Films are left out if a file has no
-    simulator states, or if no graphics library works; the explorer then shows why.
+    Phases and successes are left out if they were not recorded.
 
     Args:
         data_dir: Folder of the demonstrations, ``<task>.hdf5``.
         embeddings: Transitions of the demonstrations in these files' ``mask/valid``; an episode's
             number is its position there.
+        films: Of the same demonstrations; pictures of other transitions are left out.
         titles: Titles by task, as in :func:`~torchrl_bmrl.reports.tables.task_titles`.
 
     Raises:
@@ -50,7 +143,7 @@ def explore_demonstrations(
         >>> embeddings = Embeddings(
         ...     tasks=["reach"], task_latent=np.zeros((1, 2)), task=zeros, episode=zeros, step=zeros
         ... )
-        >>> explore_demonstrations(Path("nowhere"), embeddings)
+        >>> explore_demonstrations(Path("nowhere"), embeddings, Films())
         Traceback (most recent call last):
         ...
         torchrl_bmrl.errors.DataError: nowhere/reach.hdf5: no such file
@@ -58,11 +151,9 @@ def explore_demonstrations(
     phase = np.full(len(embeddings.task), "", dtype=object)
     success = np.full(len(embeddings.task), None, dtype=object)
     periods: dict[int, float] = {}
-    moments: list[list[Moment]] = []
-    scenes: list[tuple[str, NDArray[Any]]] = []
     for task in np.unique(embeddings.task).tolist():
         path = demonstration_path(data_dir, embeddings.tasks[task])
-        extras = ("phases", "successes", "states")
+        extras = ("phases", "successes")
         metadata = read_metadata(path)
         if fps := Source(path=path, format="robomimic", episodes={}, metadata=metadata).fps:
             periods[task] = 1.0 / fps
@@ -84,19 +175,8 @@ def explore_demonstrations(
                     phase[rows] = phase_names[recorded["phases"][steps]]
                 if "successes" in recorded:
                     success[rows] = recorded["successes"][steps] != 0
-                if number < FILMS and "states" in recorded and "model_file" in attributes:
-                    seen = np.sort(steps)[::EVERY]
-                    moments.append([(task, number, step) for step in seen.tolist()])
-                    scenes.append((attributes["model_file"], recorded["states"][seen]))
-    frames: dict[Moment, bytes] = {}
-    note = "" if scenes else "the demonstrations contain no simulator states."
-    try:
-        for when, pictures in zip(moments, _render(scenes), strict=True):
-            frames |= {
-                moment: webp(picture) for moment, picture in zip(when, pictures, strict=True)
-            }
-    except RenderError as error:
-        note = f"{error}."
+    columns = (embeddings.task, embeddings.episode, embeddings.step)
+    shown = set(zip(*(column.tolist() for column in columns), strict=True))
     named = task_titles(embeddings.tasks, titles)
     return Explorer(
         titles=[named[task] for task in embeddings.tasks],
@@ -107,8 +187,8 @@ def explore_demonstrations(
         distance=embeddings.distance,
         phase=phase.tolist(),
         success=success,
-        frames=frames,
-        note=note,
+        frames={moment: frame for moment, frame in films.frames.items() if moment in shown},
+        note=films.note,
         periods=periods,
     )
 
