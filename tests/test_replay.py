@@ -174,6 +174,19 @@ def test_data_of_a_buffer_lie_where_they_are_told_to(tmp_path: Path) -> None:
     assert any(path.is_file() for path in (tmp_path / "map").rglob("*"))
 
 
+@pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="Linux says what it was told")
+def test_the_system_is_told_that_rows_are_read_at_random(tmp_path: Path) -> None:
+    _buffer = make_replay_buffer(numbered(0, 50), batch_size=4, scratch_dir=str(tmp_path))
+    of_file: dict[str, list[str]] = {}
+    for line in Path("/proc/self/smaps").read_text().splitlines():
+        if "-" in line.split()[0]:
+            mapping = line
+        elif line.startswith("VmFlags:") and str(tmp_path) in mapping:
+            of_file[mapping.split()[-1]] = line.split()
+    assert len(of_file) == len(list(tmp_path.rglob("*.memmap"))) > 0
+    assert all("rr" in flags for flags in of_file.values())  # MADV_RANDOM
+
+
 @every_buffer
 def test_data_that_fit_a_device_lie_there(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(replay, "fits", lambda datasets, device: True)

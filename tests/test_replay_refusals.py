@@ -14,6 +14,7 @@ from torchrl_bmrl.data import (
     make_multi_task_replay_buffer,
     make_replay_buffer,
 )
+from torchrl_bmrl.data.replay import PART
 from torchrl_bmrl.errors import BMRLError, ConfigError
 
 # -- data ------------------------------------------------------------------------------------------
@@ -27,6 +28,13 @@ def test_numbers_that_are_not_finite_do_not_get_into_a_buffer(key: Any) -> None:
         make_replay_buffer(data, batch_size=2)
     with pytest.raises(BMRLError, match=r"data set 1: .* is not finite in transition 5"):
         make_multi_task_replay_buffer([episodes(), data], batch_size=2)
+
+
+def test_a_number_that_is_not_finite_is_found_in_any_part_of_long_data() -> None:
+    data = TensorDict({"x": torch.zeros(PART + 10)}, [PART + 10])
+    data["x"][PART + 3] = float("inf")
+    with pytest.raises(BMRLError, match=f"is not finite in transition {PART + 3}; valid: finite"):
+        make_replay_buffer(data, batch_size=2)
 
 
 @every_ensemble

@@ -32,6 +32,8 @@ EPISODE_NUMBERS = tuple(
 """Keys of the numbers of episodes."""
 PREFETCH = 2
 """Default number of prefetched samples if every sample is transferred to the device."""
+PART = 65536
+"""Transitions that are checked at once."""
 
 
 def with_previous(data: TensorDictBase, keys: Sequence[Any]) -> TensorDictBase:
@@ -270,6 +272,8 @@ def _make_buffer(
     except (OSError, RuntimeError) as error:
         where = scratch_dir or "the temporary folder"
         raise BMRLError(f"the data cannot be stored in {where} ({error})") from error
+    if isinstance(storage, MemmapStorage):
+        storage.expect_random_reads()
     return DatasetBuffer(
         storage=storage,
         sampler=TaskSampler(sizes, weights=weights, flat=flat, device=storage.device),
@@ -347,10 +351,12 @@ def _check_data(data: TensorDictBase, name: str) -> None:
         size = list(data.batch_size)
         raise BMRLError(f"{name}: batch size {size}; valid: [N] with at least one transition")
     for key, value in data.items(include_nested=True, leaves_only=True):
-        if value.is_floating_point() and not value.isfinite().all():
-            row = int((~value.isfinite()).nonzero()[0, 0])
-            message = f"{key!r} is not finite in transition {row}; valid: finite numbers"
-            raise BMRLError(f"{name}: {message}")
+        # In parts: the data may be larger than memory, and a check of all copies them.
+        for start, part in enumerate(value.split(PART)) if value.is_floating_point() else ():
+            if not part.isfinite().all():
+                row = PART * start + int((~part.isfinite()).nonzero()[0, 0])
+                message = f"{key!r} is not finite in transition {row}; valid: finite numbers"
+                raise BMRLError(f"{name}: {message}")
 
 
 def _layout(data: TensorDictBase) -> dict[Any, str]:
