@@ -160,6 +160,8 @@ def draw(found: Measured, path: Path) -> None:
         axes.loglog(sizes, values, "o-", label="measured")
         axes.set_xticks(sizes, [f"{size:,}" for size in sizes], minor=False)
         axes.minorticks_off()
+        shown = [*values, *expected]
+        axes.set_ylim(min(shown) / 3, 3 * max(shown))  # a change of a fifth should look like one
         axes.set(xlabel=name, ylabel="ms")
         axes.legend(fontsize=8)
     figure.savefig(path, dpi=110, metadata={"Software": None})
