@@ -3,6 +3,7 @@
 # ruff: noqa: E402 -- the package's imports need the extras that the skip checks
 from __future__ import annotations
 
+import importlib
 import io
 import os
 import sys
@@ -137,6 +138,40 @@ def test_films_are_rendered_once_and_read_from_their_file(
     assert set(first.frames) == {(0, number, step) for number in (0, 1) for step in (0, 5)}
     assert films_of(OneTask(tmp_path)) == first
     assert len(drawn) == 1
+
+
+def test_pictures_of_transitions_that_are_not_shown_are_left_out(tmp_path: Path) -> None:
+    from torchrl_bmrl.reports.films import Films, explore_demonstrations
+
+    embeddings = write_demonstrations(tmp_path)
+    lift = TASKS.index("lift")
+    films = Films(frames={(lift, 0, 0): b"first", (lift, 0, 5): b"last"})
+    shown = explore_demonstrations(tmp_path, embeddings.rows(embeddings.step < 5), films)
+    assert shown.frames == {(lift, 0, 0): b"first"}
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("encoder", ["transition", "one_hot"])
+def test_what_needs_no_student_is_done_beside_stage_2_where_there_are_workers_for_it(
+    monkeypatch: pytest.MonkeyPatch, workers: int, encoder: str
+) -> None:
+    from torchrl_bmrl.pipeline.evaluate import evaluate_job, film_job
+    from torchrl_bmrl.pipeline.settings import Settings
+
+    # The package has a function of the module's name.
+    two_stage = importlib.import_module("torchrl_bmrl.pipeline.two_stage")
+    given: list[Any] = []
+    monkeypatch.setattr(two_stage, "stage2", lambda run, beside: given.extend(beside))
+    settings = Settings(workers=workers)
+    settings.distill.task_encoder = encoder
+    two_stage._stage2(SimpleNamespace(settings=settings, playable=True, names=("reach", "lift")))
+    expected: list[Any] = [
+        (evaluate_job, (task, policy, ""))
+        for policy in ("expert", "bcq")
+        for task in ("reach", "lift")
+    ]
+    expected += [(film_job, None)] if encoder == "transition" else []
+    assert given == (expected if workers > 1 else [])
 
 
 @pytest.mark.parametrize(
