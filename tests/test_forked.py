@@ -115,6 +115,22 @@ def test_signals_to_all_processes_leave_the_server_to_its_workers(tmp_path: Path
     assert alive
 
 
+def test_a_worker_without_a_handler_of_its_own_is_ended_by_its_parent(tmp_path: Path) -> None:
+    (code,) = run(
+        tmp_path,
+        "import multiprocessing",
+        "from torchrl_bmrl.run.forked import METHOD, start_server",
+        "start_server()",
+        "context = multiprocessing.get_context(METHOD)",
+        "process = context.Process(target=time.sleep, args=(60,), daemon=True)",
+        "process.start()",
+        "process.terminate()",
+        "process.join(20)",
+        "print(json.dumps(process.exitcode))",
+    )
+    assert code == -15
+
+
 @pytest.mark.parametrize(
     ("arguments", "beside", "starts"),
     [
