@@ -124,6 +124,7 @@ def test_a_worker_without_a_handler_of_its_own_is_ended_by_its_parent(tmp_path: 
         "context = multiprocessing.get_context(METHOD)",
         "process = context.Process(target=time.sleep, args=(60,), daemon=True)",
         "process.start()",
+        "time.sleep(2)",
         "process.terminate()",
         "process.join(20)",
         "print(json.dumps(process.exitcode))",
