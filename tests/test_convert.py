@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import json
+import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -323,3 +325,20 @@ def test_whole_numbers_that_become_floats_are_named(path: Path, tmp_path: Path) 
             demo["actions"] = actions
     notes = convert(path, tmp_path / "a", to="lerobot", fps=20).notes
     assert "whole numbers become float32" in notes
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+def test_a_source_that_changes_while_it_is_converted_leaves_no_file(
+    path: Path, tmp_path: Path, in_place: bool
+) -> None:
+    other = Path(shutil.copy(path, tmp_path / "other.hdf5"))
+
+    def change(_: int) -> None:
+        if in_place:
+            path.write_bytes(path.read_bytes())  # by another writer: as long, and later
+        elif other.exists():
+            os.replace(other, path)
+
+    with pytest.raises(DataError, match=r"lift\.hdf5: changed while it was read; valid: a file"):
+        convert(path, tmp_path / "new.hdf5", to="robomimic", report=change)
+    assert not (tmp_path / "new.hdf5").exists()

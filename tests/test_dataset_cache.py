@@ -66,6 +66,48 @@ def test_a_changed_file_is_converted_anew(path: Path, converted: list[Path]) -> 
     assert torch.equal(old[:]["next", "reward"], before)
 
 
+def test_a_file_that_is_replaced_while_it_is_converted_is_read_whole(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, other = path.read_bytes(), tmp_path / "other.hdf5"
+    shutil.copy(path, other)
+    edit(other, put("data/demo_0/rewards", np.full(LENGTHS[0], 9.0)))
+    convert = datasets._convert
+
+    def replaced(source: Path, *args: Any) -> None:
+        if other.exists():
+            os.replace(other, source)
+        convert(source, *args)
+
+    monkeypatch.setattr(datasets, "_convert", replaced)
+    first, second = RobomimicExperienceReplay(path), RobomimicExperienceReplay(path)
+    rewards = [replay[:]["next", "reward"][: LENGTHS[0]] for replay in (first, second)]
+    assert (rewards[0] < 1).all()
+    assert (rewards[1] == 9).all()
+    path.write_bytes(before)
+    again = RobomimicExperienceReplay(path)
+    assert again.data_path == first.data_path
+    assert torch.equal(again[:]["next", "reward"], first[:]["next", "reward"])
+
+
+def test_a_file_that_is_written_while_it_is_converted_is_refused(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = datasets._write_rows
+
+    def written(*args: Any) -> Any:
+        data = write(*args)
+        with path.open("r+b") as file:  # the same file, not another one of its name
+            file.seek(-1, os.SEEK_END)
+            file.write(b"!")
+        return data
+
+    monkeypatch.setattr(datasets, "_write_rows", written)
+    with pytest.raises(DataError, match=r"lift\.hdf5: changed while it was read; valid: a"):
+        RobomimicExperienceReplay(path)
+    assert entries(path.parent) == [path.name]
+
+
 def test_each_set_of_options_has_its_folder(path: Path, converted: list[Path]) -> None:
     options: list[dict[str, Any]] = [
         {},

@@ -14,6 +14,7 @@ from torchrl_bmrl.data.account import Account
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.options import ReadOptions
 from torchrl_bmrl.data.schema import Layout, check_episode, check_fps, layout_of
+from torchrl_bmrl.data.source_files import check_unchanged
 from torchrl_bmrl.data.sources import (
     Source,
     find_format,
@@ -177,6 +178,9 @@ class Stream:
                 yield episode
                 self.report(1)
         # Before the writer finishes, so that a refused data set is not written.
+        for source in self.sources:
+            if source.identity is not None:
+                check_unchanged(source.path, source.identity)
         self.account.check(self.sources[0].path, self.sources[0].options)
 
     def _count(self, name: str, episode: Episode) -> None:

@@ -25,13 +25,19 @@ from torchrl.envs.transforms import Transform
 
 from torchrl_bmrl.data.convert import Stream
 from torchrl_bmrl.data.episodes import as_tensordict
+from torchrl_bmrl.data.hdf5 import open_file, update_digest
 from torchrl_bmrl.data.options import Bounds, LastStep, ReadOptions, Reward
 from torchrl_bmrl.data.robomimic import count_steps
 from torchrl_bmrl.data.sampler import HandsOutCopies, read_memmap
+from torchrl_bmrl.data.source_files import CHANGED
 from torchrl_bmrl.data.sources import find_format, open_source
 from torchrl_bmrl.errors import BMRLError, DataError
+from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import new_folder
 from torchrl_bmrl.functional import mean_and_scale
+
+with needs("data"):
+    import h5py
 
 LAYOUT_VERSION = 3
 """Part of the hash in a cache's name: another version converts anew."""
@@ -154,14 +160,18 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
         if chosen.observation_keys is not None:
             # Sorted, so that one folder serves all orders.
             options["observation_keys"] = sorted(chosen.observation_keys)
-        self._path = self.root / f"{source.stem}-{_digest(source, options, split_trajs)}"
-        read = _read(self._path)
-        for _ in range(ATTEMPTS):
-            if read is not None:
-                break
-            _set_aside(self._path)
-            _convert(source, self._path, options, split_trajs)
+        if not source.is_file():
+            raise DataError(source, None, "no such file")
+        with open_file(source) as file:  # one handle: the name may get another file at any time
+            digest = _digest(source, file, options, split_trajs)
+            self._path = self.root / f"{source.stem}-{digest}"
             read = _read(self._path)
+            for _ in range(ATTEMPTS):
+                if read is not None:
+                    break
+                _set_aside(self._path)
+                _convert(source, file, self._path, options, split_trajs)
+                read = _read(self._path)
         if read is None:
             message = "is damaged as soon as it is written; valid: root=, a folder on a sound disk"
             raise DataError(source, None, f"its conversion {self._path} {message}")
@@ -251,29 +261,24 @@ def _set_aside(path: Path) -> None:
     shutil.rmtree(aside, ignore_errors=True)
 
 
-def _digest(source: Path, options: Mapping[str, Any], split_trajs: bool) -> str:
-    """Hash of a file's content and of the options."""
-    if not source.is_file():
-        raise DataError(source, None, "no such file")
+def _digest(source: Path, file: h5py.File, options: Mapping[str, Any], split_trajs: bool) -> str:
+    """Hash of an open file's content and of the options."""
     digest = hashlib.sha256(json.dumps([LAYOUT_VERSION, dict(options), split_trajs]).encode())
-    try:
-        with source.open("rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
-    except OSError as error:
-        raise DataError(source, None, f"unreadable ({error})") from error
+    update_digest(digest, source, file)
     return digest.hexdigest()[:16]
 
 
-def _convert(source: Path, target: Path, options: Mapping[str, Any], split_trajs: bool) -> None:
-    """Converts a file into a folder that appears as a whole, or not at all."""
+def _convert(
+    source: Path, file: h5py.File, target: Path, options: Mapping[str, Any], split_trajs: bool
+) -> None:
+    """Converts an open file into a folder that appears as a whole, or not at all."""
     try:
         with new_folder(target, exist_ok=True) as folder:
-            if (form := find_format(source)) != "robomimic":
+            if (form := find_format(source, file)) != "robomimic":
                 raise DataError(source, None, _other_format(source, form))
-            with open_source(source, to_train=True, **options) as data_set:
+            with open_source(source, to_train=True, file=file, **options) as data_set:
                 data_set.check()
-                steps = count_steps(source, data_set.episodes)
+                steps = count_steps(source, data_set.episodes, file)
                 stream = Stream([data_set])
                 data = _write_rows(folder / "data", stream, steps)
                 metadata = dict(data_set.metadata) | {
@@ -282,6 +287,9 @@ def _convert(source: Path, target: Path, options: Mapping[str, Any], split_trajs
                     "warnings": list(stream.account.warnings()),
                     "oddities": list(data_set.oddities),
                 }
+            # The folder's name promises this content.
+            if not target.name.endswith(_digest(source, file, options, split_trajs)):
+                raise DataError(source, None, CHANGED)
             metadata["statistics"] = _statistics(data)
             if split_trajs:
                 _split(folder / "data")

@@ -43,6 +43,26 @@ def open_file(path: str | Path) -> h5py.File:
         raise DataError(path, None, f"not a complete HDF5 file ({error})") from error
 
 
+def update_digest(digest: Any, path: str | Path, file: h5py.File) -> None:
+    """Adds the bytes of an open file to a digest: of this file, even if its name has another now.
+
+    Args:
+        digest: one of hashlib's.
+        path: of the file, for messages.
+        file: open for reading.
+
+    Raises:
+        DataError: if it cannot be read.
+    """
+    try:
+        handle, start = file.id.get_vfd_handle(), 0
+        while block := os.pread(handle, 1 << 20, start):
+            digest.update(block)
+            start += len(block)
+    except DAMAGE as error:
+        raise DataError(path, None, f"unreadable ({error})") from error
+
+
 @contextmanager
 def _reading(path: str | Path, key: str, what: str = "") -> Iterator[None]:
     """Turns what h5py raises on damage into an error that names file and key."""

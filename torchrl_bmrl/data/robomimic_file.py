@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -92,18 +93,21 @@ def count_episodes(path: str | Path) -> int:
         return len(_demonstrations(path, file)[0])
 
 
-def count_steps(path: str | Path, episodes: Mapping[str, Episode]) -> int:
+def count_steps(
+    path: str | Path, episodes: Mapping[str, Episode], file: h5py.File | None = None
+) -> int:
     """Total number of steps of a file's episodes, read from the shapes of their arrays if possible.
 
     Args:
         path: the file.
         episodes: those to count, as :func:`open_episodes` returns them.
+        file: the same file if it is open already.
 
     Raises:
         DataError: if the file is damaged or lacks the actions of one.
     """
     total = 0
-    with open_file(path) as file:
+    with nullcontext(file) if file else open_file(path) as file:
         for name in episodes:
             key = f"data/{name}/actions"
             try:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +95,11 @@ def open_episodes(
 
 @contextmanager
 def open_data(
-    path: str | Path, options: ReadOptions, *, to_train: bool = False
+    path: str | Path,
+    options: ReadOptions,
+    *,
+    to_train: bool = False,
+    file: h5py.File | None = None,
 ) -> Iterator[Opened]:
     """Opens a file; each episode is read on access, as the file stores it.
 
@@ -103,12 +107,13 @@ def open_data(
         path: the HDF5 file; it is only read.
         options: see :func:`open_episodes`.
         to_train: whether to skip the episodes' attributes and all extras except ``successes``.
+        file: the same file if it is open already.
 
     Raises:
         DataError: as :func:`open_episodes`.
     """
     extras = ("successes",) if to_train else None
-    with open_file(path) as file:
+    with nullcontext(file) if file else open_file(path) as file:
         yield Opened(
             episodes=_episodes(path, file, options, extras, not to_train),
             metadata=metadata_of(path, file),

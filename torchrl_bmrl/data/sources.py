@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
 from torchrl_bmrl.data.hdf5 import open_file, read_names
 from torchrl_bmrl.data.options import Bounds, ReadOptions, check_bounds, join_bounds
 from torchrl_bmrl.data.raw import Opened, RawEpisode, complete, success_fault
+from torchrl_bmrl.data.source_files import Identity, identity_of
 from torchrl_bmrl.errors import ConfigError, DataError
 
 _STRUCTURE = (
@@ -47,6 +48,7 @@ class Source:
         account: counts the episodes that are left out.
         problems: faults outside the episodes: key and message of each.
         oddities: warnings about the data set as a whole.
+        identity: of its files when it was opened; ``None`` if they are not compared.
     """
 
     path: Path
@@ -60,6 +62,7 @@ class Source:
     account: Account = field(default_factory=Account)
     problems: Sequence[tuple[str, str]] = ()
     oddities: Sequence[str] = ()
+    identity: Identity | None = None
 
     @property
     def fps(self) -> float | None:
@@ -83,8 +86,12 @@ class Source:
             raise DataError(self.path, key, message)
 
 
-def find_format(path: Path) -> str:
+def find_format(path: Path, file: Any = None) -> str:
     """Format of a data set: one of :data:`FORMATS`.
+
+    Args:
+        path: the file or folder.
+        file: the same HDF5 file if it is open already.
 
     Raises:
         DataError: if it is none of them.
@@ -97,7 +104,7 @@ def find_format(path: Path) -> str:
         valid = "valid: Minari's, LeRobot's, a file"
         message = "a folder without data/main_data.hdf5 or meta/info.json"
         raise DataError(path, None, f"{message}; {valid}")
-    with open_file(path) as file:
+    with nullcontext(file) if file else open_file(path) as file:
         if d4rl.is_d4rl(path, file):
             return "d4rl"
         for name in read_names(path, file, "data"):
@@ -119,6 +126,7 @@ def open_source(
     task: str | None = None,
     tracking: float = 1.0,
     to_train: bool = False,
+    file: Any = None,
     **options: Any,
 ) -> Iterator[Source]:
     """Opens a data set of any format.
@@ -130,6 +138,7 @@ def open_source(
         tracking: see :func:`torchrl_bmrl.data.robosuite.open_episodes`.
         to_train: whether to skip what training does not need in a file in robomimic's layout:
             attributes of the episodes, and extras except ``successes``.
+        file: the same file in robomimic's layout, open already; who opened it knows its content.
         options: see :class:`~torchrl_bmrl.data.options.ReadOptions`.
 
     Raises:
@@ -151,7 +160,8 @@ def open_source(
     """
     path = Path(path).expanduser()
     chosen = ReadOptions(**options)
-    form = find_format(path)
+    identity = None if file else identity_of(path)
+    form = find_format(path, file)
     if form != "robosuite" and (task is not None or tracking != 1.0):
         raise ConfigError(
             f"task and tracking are for robosuite's demo.hdf5; {path} has the format {form}"
@@ -164,12 +174,13 @@ def open_source(
         raise ConfigError(f"horizon is for D4RL's files; {path} has the format {form}")
     with ExitStack() as stack:
         if form == "robomimic":
-            opened = stack.enter_context(robomimic.open_data(path, chosen, to_train=to_train))
+            reader = robomimic.open_data(path, chosen, to_train=to_train, file=file)
+            opened = stack.enter_context(reader)
         elif form == "robosuite":
             opened = _open_robosuite(stack, path, task, tracking)
         else:
             opened = _open_other(stack, path, form, chosen)
-        yield _apply(path, form, opened, chosen)
+        yield replace(_apply(path, form, opened, chosen), identity=identity)
 
 
 @contextmanager
