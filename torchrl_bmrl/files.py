@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
 import math
@@ -141,6 +142,40 @@ def new_folder(path: str | os.PathLike[str], *, exist_ok: bool = False) -> Itera
                 raise
     finally:  # also after an interrupt
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def digest_of(*paths: Path) -> str:
+    """SHA-256 of a file's content, or of the names and contents of several files.
+
+    Args:
+        *paths: The files, at least one.
+
+    Raises:
+        DataError: if one cannot be read.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "a.txt"
+        >>> _ = path.write_text("1 2 3")
+        >>> digest_of(path)[:8]
+        'ff4fda51'
+    """
+    digests = []
+    for path in paths:
+        digest = hashlib.sha256()
+        try:
+            with path.open("rb") as file:
+                while block := file.read(1 << 20):
+                    digest.update(block)
+        except OSError as error:
+            raise DataError(path, None, f"unreadable ({error})") from error
+        digests.append(digest.hexdigest())
+    if len(digests) == 1:
+        return digests[0]
+    # The names below the common folder, which may have another name elsewhere.
+    root = os.path.commonpath(paths)
+    lines = [f"{x} {os.path.relpath(y, root)}" for x, y in zip(digests, paths, strict=True)]
+    return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()
 
 
 def read_json(path: str | os.PathLike[str], what: str) -> Any:

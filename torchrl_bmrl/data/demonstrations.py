@@ -11,9 +11,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_bmrl.data.convert import Stream
 from torchrl_bmrl.data.datasets import RobomimicExperienceReplay
 from torchrl_bmrl.data.robomimic import open_episodes
 from torchrl_bmrl.data.robomimic_file import CONTEXT_MASK, read_metadata
+from torchrl_bmrl.data.source_files import CHANGED
+from torchrl_bmrl.data.sources import open_sources
 from torchrl_bmrl.envs.transforms import (
     ObservationStatistics,
     make_observation_transform,
@@ -21,7 +24,7 @@ from torchrl_bmrl.envs.transforms import (
     transform_data,
 )
 from torchrl_bmrl.errors import DataError
-from torchrl_bmrl.files import read_json, write_atomic
+from torchrl_bmrl.files import digest_of, read_json, write_atomic
 from torchrl_bmrl.tasks import Task
 
 TRANSITION_KEYS = (
@@ -149,7 +152,7 @@ def write_statistics(data_dir: Path, tasks: Sequence[Task]) -> ObservationStatis
     """Computes the statistics of the training demonstrations and writes ``statistics.json``.
 
     ``loc`` and ``scale`` over all tasks together normalise observations; those of each task are
-    stored under ``tasks``.
+    stored under ``tasks``, with the SHA-256 of the task's file (:func:`check_demonstrations`).
 
     Args:
         data_dir: folder with ``<task>.hdf5``, each with a mask ``train``.
@@ -172,12 +175,15 @@ def write_statistics(data_dir: Path, tasks: Sequence[Task]) -> ObservationStatis
     """
     if not tasks:
         raise DataError(data_dir, None, "no tasks; valid: at least one")
+    paths = [demonstration_path(data_dir, task.name) for task in tasks]
+    digests = [digest_of(path) for path in paths]
     raw = [
-        read_demonstrations(
-            demonstration_path(data_dir, task.name), task, split="train", index=index
-        )
-        for index, task in enumerate(tasks)
+        read_demonstrations(path, task, split="train", index=index)
+        for index, (path, task) in enumerate(zip(paths, tasks, strict=True))
     ]
+    for path, digest in zip(paths, digests, strict=True):
+        if digest_of(path) != digest:
+            raise DataError(path, None, CHANGED)
     first = _layout(tasks[0], raw[0])
     for task, data in zip(tasks, raw, strict=True):
         if (layout := _layout(task, data)) != first:
@@ -188,13 +194,57 @@ def write_statistics(data_dir: Path, tasks: Sequence[Task]) -> ObservationStatis
             )
     statistics = ObservationStatistics.of(raw, tasks)
     each = {
-        task.name: ObservationStatistics.of([data], [task]).to_lists() | {"transitions": len(data)}
-        for task, data in zip(tasks, raw, strict=True)
+        task.name: ObservationStatistics.of([data], [task]).to_lists()
+        | {"transitions": len(data), "sha256": digest}
+        for task, data, digest in zip(tasks, raw, digests, strict=True)
     }
     write_atomic(
         data_dir / "statistics.json", json.dumps(statistics.to_lists() | {"tasks": each}) + "\n"
     )
     return statistics
+
+
+def check_demonstrations(data_dir: Path, tasks: Sequence[Task]) -> bool:
+    """Checks that the demonstrations are those that ``statistics.json`` was computed from.
+
+    Args:
+        data_dir: folder with ``<task>.hdf5``. Missing files are not compared.
+        tasks: the tasks.
+
+    Returns:
+        whether the file names all these tasks and the content of their files, as those of earlier
+        versions do not.
+
+    Raises:
+        DataError: naming the first file of other content, or its damage.
+
+    Example:
+        >>> import tempfile
+        >>> check_demonstrations(Path(tempfile.mkdtemp()), [])
+        False
+    """
+    path = data_dir / "statistics.json"
+    try:
+        each = read_json(path, "the statistics of a data set")["tasks"]
+        known = {name: str(each[name]["sha256"]) for name in each if "sha256" in each[name]}
+    except (DataError, KeyError, TypeError):  # reported when it is read
+        return False
+    for task in tasks:
+        file = demonstration_path(data_dir, task.name)
+        if task.name not in known or not file.is_file():
+            continue
+        if (digest := digest_of(file)) != known[task.name]:
+            with open_sources(file) as sources:  # damage is named more exactly
+                for _ in Stream(sources):
+                    pass
+            raise DataError(
+                file,
+                None,
+                f"its content is {digest[:12]} and was {known[task.name][:12]} (SHA-256) when "
+                f"{path.name} was written, which normalises the observations of this run; valid: "
+                "the file as it was, or another run_dir",
+            )
+    return list(known) == [task.name for task in tasks]
 
 
 def _layout(task: Task, data: TensorDictBase) -> str:

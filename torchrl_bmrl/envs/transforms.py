@@ -155,6 +155,24 @@ class ObservationStatistics:
         lists = {"loc": self.loc.tolist(), "scale": self.scale.tolist()}
         return lists if self.parts is None else lists | {"parts": list(self.parts)}
 
+    def close_to(self, other: ObservationStatistics) -> bool:
+        """Whether networks that were trained with one read the same from the other.
+
+        Machines compute the last digits of the same statistics differently.
+
+        Args:
+            other: statistics, which may be of another size.
+
+        Example:
+            >>> one = ObservationStatistics(loc=torch.zeros(2), scale=torch.ones(2))
+            >>> one.close_to(ObservationStatistics(loc=torch.ones(2), scale=torch.ones(2)))
+            False
+        """
+        if self.loc.shape != other.loc.shape:
+            return False
+        apart = torch.cat([(self.loc - other.loc) / self.scale, 1 - other.scale / self.scale])
+        return bool((apart.abs() < 1e-3).all())
+
     @classmethod
     def of(cls, datasets: Sequence[TensorDictBase], tasks: Sequence[Task]) -> ObservationStatistics:
         """Statistics over all tasks together; every task has the same weight.

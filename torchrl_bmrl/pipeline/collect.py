@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from torchrl_bmrl.data.demonstrations import demonstration_path, write_statistics
+from torchrl_bmrl.data.demonstrations import (
+    check_demonstrations,
+    demonstration_path,
+    read_statistics,
+    write_statistics,
+)
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.importing import (
     find_action_bounds,
@@ -15,7 +20,7 @@ from torchrl_bmrl.data.robomimic_file import CONTEXT_MASK
 from torchrl_bmrl.data.sources import join_bounds
 from torchrl_bmrl.envs.gym import action_bounds
 from torchrl_bmrl.envs.transforms import make_env
-from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.experts.collect import collect_demonstrations
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.run.progress import progress
@@ -69,7 +74,11 @@ def collect(run: Run) -> None:
             experts=settings.experts,
         )
     _import_files(run)
-    statistics = write_statistics(run.data_dir, run.tasks)
+    # Agents keep the normalisation that they were trained with, on another machine too.
+    if check_demonstrations(run.data_dir, run.tasks):
+        statistics = read_statistics(run.data_dir)
+    else:
+        statistics = write_statistics(run.data_dir, run.tasks)
     for task in run.tasks:
         if task.files is not None and task.make_env is not None:
             make_env(task, statistics).close()  # raises an error for a wrong environment
@@ -85,10 +94,11 @@ def _import_files(run: Run) -> None:
     with progress(len(missing), "importing demonstrations", "file") as bar:
         for task in missing:
             assert task.files is not None
+            target = demonstration_path(run.data_dir, task.name)
             try:
                 import_demonstrations(
                     task.files.path,
-                    demonstration_path(run.data_dir, task.name),
+                    target,
                     options=_options(task),
                     valid_share=task.files.valid_share,
                     context=run.settings.distill.reads_contexts,
@@ -97,6 +107,11 @@ def _import_files(run: Run) -> None:
             except DataError as error:
                 if error.key == f"mask/{CONTEXT_MASK}":
                     error.message += f", or settings that read none: {READ_NONE}"
+                raise
+            try:
+                run.check_files()
+            except BMRLError:  # replaced since the run was opened
+                target.unlink()
                 raise
             bar.update(1)
 

@@ -70,7 +70,7 @@ def evaluate(run: Run) -> str:
     run.check_open()
     settings, alone = run.settings.evaluate, run.settings.evaluate.policy is not None
     if alone:
-        known = run.student()[1]["tasks"]
+        known = run.policy()[1]["tasks"]
         if not set(run.names) <= set(known):
             raise ConfigError(f"tasks is {list(run.names)}; valid for {settings.policy}: {known}")
     look = not alone and shows_embedding(run)
@@ -211,7 +211,7 @@ def evaluate_job(job: tuple[Run, tuple[str, str, str]], report: Report) -> list[
         if policy_name == "bcq":
             policy = make_policy(run.teacher(name), run.settings)
             return run.play(task, policy, seeds=seeds, report=report)
-        student, metadata = run.student()
+        student, metadata = run.policy()
         policy = student.policy(num_candidates=count, latent_clip=metadata["latent_clip"])
         transform = source_of_m(run, name, student, metadata, source)
         statistics = ObservationStatistics.from_lists(metadata["statistics"])

@@ -80,7 +80,7 @@ def export(run: Run) -> None:
         torchrl_bmrl.errors.BMRLError: runs/mine is not open; valid: with Run(settings) as run: ...
     """
     run.check_open()
-    student, metadata = run.student()
+    student, metadata = run.policy()
     if not run.settings.evaluate.policy:
         _write_policy(run, student, metadata)
     _write_onnx(run, student, metadata)

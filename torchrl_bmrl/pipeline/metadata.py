@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import math
 import re
+import reprlib
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
+
+from torchrl_bmrl.envs.transforms import ObservationStatistics
+from torchrl_bmrl.errors import CheckpointError
 
 
 def is_number(x: Any) -> bool:
@@ -36,3 +42,27 @@ def are_statistics(x: Any) -> bool:
         and all(map(is_number, [*x["loc"], *x["scale"]]))
         and all(scale > 0 for scale in x["scale"])
     )
+
+
+def check_statistics(
+    path: Path, metadata: Mapping[str, Any], statistics: ObservationStatistics
+) -> None:
+    """Checks that a policy was trained on observations that are normalised as here.
+
+    Args:
+        path: its checkpoint, for the message.
+        metadata: of the checkpoint.
+        statistics: of the normalisation.
+
+    Raises:
+        CheckpointError: if it was trained with other statistics, or does not tell them.
+    """
+    own: Any = metadata.get("statistics")
+    if not are_statistics(own):
+        raise CheckpointError(path, f"statistics are {reprlib.repr(own)}; valid: loc and scale")
+    if not statistics.close_to(ObservationStatistics.from_lists(own)):
+        raise CheckpointError(
+            path,
+            "trained on observations that other statistics normalised than data/statistics.json; "
+            "valid: a policy of these demonstrations, or another run_dir",
+        )

@@ -17,6 +17,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Transform
 
 from torchrl_bmrl.data.demonstrations import (
+    check_demonstrations,
     demonstration_path,
     has_contexts,
     load_transitions,
@@ -29,16 +30,19 @@ from torchrl_bmrl.evaluation.rollout import EpisodeOutcome, evaluate_policy
 from torchrl_bmrl.families import Family, find_family
 from torchrl_bmrl.objectives import BCQLoss
 from torchrl_bmrl.pipeline.agents import load_bcq_loss
+from torchrl_bmrl.pipeline.metadata import check_statistics
 from torchrl_bmrl.pipeline.settings import SIX_TASKS, Settings
 from torchrl_bmrl.pipeline.student import Student, load_student
 from torchrl_bmrl.pipeline.task_files import (
     check_contexts,
     check_names,
+    input_files,
     make_tasks,
     read_task_file,
     train_episodes,
     with_run_options,
 )
+from torchrl_bmrl.run.folder import check_files
 from torchrl_bmrl.run.locks import lock_run
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
 from torchrl_bmrl.tasks import Task, compose_tasks, import_module_of
@@ -101,10 +105,12 @@ class Run:
     def __enter__(self) -> Run:
         # Jobs that train only some tasks lock these, so that other jobs can train the rest.
         parts = self.settings.only or ["run", *self.names]
-        opened = ExitStack()
         settings, defaults = asdict(self.settings), asdict(Settings())
-        opened.enter_context(lock_run(self.folder, settings, parts, defaults))
-        self._opened = opened
+        with ExitStack() as opened:
+            files = input_files(self.settings, self.tasks)
+            opened.enter_context(lock_run(self.folder, settings, parts, defaults, files))
+            check_demonstrations(self.data_dir, self.tasks)
+            self._opened = opened.pop_all()
         gc.freeze()  # robosuite collects garbage at every env.close(): leave imported modules out
         return self
 
@@ -144,38 +150,8 @@ class Run:
         """Whether every task has an environment."""
         return all(task.make_env is not None for task in self.tasks)
 
-    def check_playable(self, others: Sequence[Task] = ()) -> None:
-        """Checks that every task has an environment.
-
-        Args:
-            others: further tasks to check.
-
-        Raises:
-            ConfigError: naming the tasks without one.
-        """
-        without = [task.name for task in (*self.tasks, *others) if task.make_env is None]
-        if without:
-            raise ConfigError(
-                f"{', '.join(without)} of tasks have no environment; valid: tasks that have one"
-            )
-
-    def check_single_actions(self, where: str) -> None:
-        """Checks that the agents of stage 1 propose single actions.
-
-        Args:
-            where: what needs them, for the message.
-
-        Raises:
-            ConfigError: if they propose chunks.
-        """
-        if (chunk := self.settings.bcq.action_chunk) > 1:
-            raise ConfigError(f"bcq.action_chunk is {chunk}; valid for {where}: 1")
-
     def task(self, name: str) -> Task:
         """Returns a task of the run.
-
-        Args:
-            name: name of the task.
 
         Raises:
             UnknownNameError: for a name that is not a task of the run.
@@ -216,6 +192,14 @@ class Run:
         """Folder of the demonstrations, ``<task>.hdf5``, and their statistics."""
         return self.folder / "data"
 
+    def check_files(self) -> None:
+        """Checks that the files that the settings name have the content that the run knows.
+
+        Raises:
+            ConfigError: naming the first one with another content.
+        """
+        check_files(self.folder, input_files(self.settings, self.tasks))
+
     @property
     def student_path(self) -> Path:
         """The distilled policy: this run's checkpoint, or the exported file of the settings."""
@@ -224,11 +208,7 @@ class Run:
         return self.folder / "distill" / "checkpoint.safetensors"
 
     def demonstrations(self, name: str) -> Path:
-        """Returns the file with a task's demonstrations.
-
-        Args:
-            name: name of the task.
-        """
+        """Returns the file with a task's demonstrations."""
         return demonstration_path(self.data_dir, name)
 
     def agent_path(self, name: str) -> Path:
@@ -252,26 +232,47 @@ class Run:
             split: ``"train"``, ``"valid"`` or ``"context"``.
         """
         index = self.names.index(name)
-        return load_transitions(
-            self.data_dir, self.tasks[index], self.statistics, split=split, index=index
-        )
+        task = self.tasks[index]
+        data = load_transitions(self.data_dir, task, self.statistics, split=split, index=index)
+        check_demonstrations(self.data_dir, [task])  # of what was read
+        return data
 
     @property
     def has_contexts(self) -> bool:
         """Whether the demonstrations of every task have episodes of another behaviour."""
         return all(has_contexts(self.demonstrations(name)) for name in self.names)
 
-    def teacher(self, name: str) -> BCQLoss:
-        """Returns the trained agent of a task, frozen.
+    def teacher(self, name: str, path: Path | None = None) -> BCQLoss:
+        """Returns a trained agent, frozen.
 
         Args:
-            name: name of the task.
+            name: name of the agent; a task's first agent has the task's name.
+            path: its checkpoint; by default that of stage 1.
+
+        Raises:
+            CheckpointError: also if its observations were normalised with other statistics.
         """
-        return load_bcq_loss(self.agent_path(name))[0]
+        path = path or self.agent_path(name)
+        loss, metadata = load_bcq_loss(path)
+        check_statistics(path, metadata, self.statistics)
+        return loss
 
     def student(self) -> tuple[Student, dict[str, Any]]:
-        """Returns the distilled student and its checkpoint's metadata."""
-        return load_student(self.student_path)
+        """Returns the distilled student and its checkpoint's metadata.
+
+        Raises:
+            CheckpointError: also if its observations were normalised with other statistics.
+        """
+        student, metadata = self.policy()
+        check_statistics(self.student_path, metadata, self.statistics)
+        return student, metadata
+
+    def policy(self) -> tuple[Student, dict[str, Any]]:
+        """Returns the same, also for an exported policy, which has statistics of its own."""
+        found = load_student(self.student_path)
+        if self.settings.evaluate.policy:
+            self.check_files()
+        return found
 
     def once(
         self,

@@ -105,6 +105,18 @@ class BCQSettings:
     seeds: int = setting(1, above=0)  # agents per task; further ones: bcq/<task>-<seed>
     stacked: bool = False  # all agents in one program, for a GPU; else one process each
 
+    def check_single_actions(self, where: str) -> None:
+        """Checks that the agents propose single actions.
+
+        Args:
+            where: what needs them, for the message.
+
+        Raises:
+            ConfigError: if they propose chunks.
+        """
+        if self.action_chunk > 1:
+            raise ConfigError(f"bcq.action_chunk is {self.action_chunk}; valid for {where}: 1")
+
 
 @dataclass
 class DistillSettings:

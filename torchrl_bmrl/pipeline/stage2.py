@@ -75,7 +75,7 @@ def stage2(run: Run, *, beside: Sequence[tuple[Callable[..., Any], Any]] = ()) -
         ...
         torchrl_bmrl.errors.BMRLError: runs/mine is not open; valid: with Run(settings) as run: ...
     """
-    run.check_single_actions("the distillation")
+    run.settings.bcq.check_single_actions("the distillation")
     run.jobs(
         _call,
         [(train_student, StudentJob(run.settings.distill, "distill")), *beside],

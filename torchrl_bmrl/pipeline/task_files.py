@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_bmrl.data.options import ReadOptions
+from torchrl_bmrl.data.source_files import files_of
 from torchrl_bmrl.envs.gym import make_gym_env
 from torchrl_bmrl.errors import BMRLError, ConfigError
 from torchrl_bmrl.families import tasks_of
 from torchrl_bmrl.pipeline.settings import Settings
-from torchrl_bmrl.run.folder import read_yaml
+from torchrl_bmrl.run.folder import Files, read_yaml
 from torchrl_bmrl.tasks import DemonstrationFiles, Task, get_task
 
 
@@ -163,6 +164,17 @@ def with_run_options(task: Task, settings: Settings) -> Task:
     return task.with_options(**known)
 
 
+def input_files(settings: Settings, tasks: Sequence[Task]) -> Files:
+    """Returns the files outside of the run folder that decide a run's results, by setting."""
+    found = {
+        f"tasks.{task.name}.demonstrations": files_of(task.files.path)
+        for task in tasks
+        if task.files is not None
+    }
+    policy = settings.evaluate.policy
+    return found | ({"evaluate.policy": files_of(policy)} if policy else {})
+
+
 def check_names(settings: Settings, tasks: Sequence[Task]) -> None:
     """Raises an error for settings of unknown tasks; other registered tasks are allowed."""
     episodes, after = settings.collect.train_episodes, settings.collect.after
@@ -177,6 +189,21 @@ def check_names(settings: Settings, tasks: Sequence[Task]) -> None:
                 f"collect.experts has {task.name}, whose demonstrations are files; valid: tasks "
                 "with a scripted expert, or default"
             )
+
+
+def check_playable(tasks: Sequence[Task]) -> None:
+    """Checks that every task has an environment.
+
+    Args:
+        tasks: of a run, and others that it plays.
+
+    Raises:
+        ConfigError: naming the tasks without one.
+    """
+    if without := [task.name for task in tasks if task.make_env is None]:
+        raise ConfigError(
+            f"{', '.join(without)} of tasks have no environment; valid: tasks that have one"
+        )
 
 
 def train_episodes(settings: Settings, tasks: Sequence[Task]) -> dict[str, int]:

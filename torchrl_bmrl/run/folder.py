@@ -7,7 +7,7 @@ import json
 import logging
 import platform
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import torch
 from torchrl_bmrl import __version__
 from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.extras import needs
-from torchrl_bmrl.files import link_or_copy, read_json, write_atomic
+from torchrl_bmrl.files import digest_of, link_or_copy, read_json, write_atomic
 
 with needs("recipes"):
     import yaml
@@ -61,8 +61,17 @@ ADOPTED: tuple[tuple[str, tuple[str, ...]], ...] = (
 PACKAGES = ("torchrl", "tensordict", "robosuite", "mujoco", "gymnasium", "numpy", "h5py")
 
 
+INPUTS = "inputs.json"
+"""File with the digests of the files that a folder's settings name."""
+Files = Mapping[str, Sequence[Path]]
+"""Files that decide a run's results, by the setting that names them."""
+
+
 def open_run(
-    run_dir: Path, settings: Mapping[str, Any], defaults: Mapping[str, Any] | None = None
+    run_dir: Path,
+    settings: Mapping[str, Any],
+    defaults: Mapping[str, Any] | None = None,
+    files: Files | None = None,
 ) -> None:
     """Creates a run folder, or checks that an existing one has the same settings.
 
@@ -75,9 +84,11 @@ def open_run(
         settings: the resolved configuration.
         defaults: defaults of the settings. A setting that an earlier version did not have counts
             as its default in that version's folders, since defaults keep their behaviour.
+        files: files that decide the results. Their digests are stored in ``inputs.json``.
 
     Raises:
-        ConfigError: naming the first setting that differs from the folder's run.
+        ConfigError: naming the first setting that differs from the folder's run, or the first file
+            whose content does.
         DataError: if ``base`` is not a run's folder.
 
     Example:
@@ -107,10 +118,70 @@ def open_run(
                         target = run_dir / source.relative_to(base)
                         if not target.exists():  # another process may have made it
                             link_or_copy(source, target)
+            if all(_section(theirs, key) == _section(now, key) for key in _START):
+                # The demonstrations were imported from these.
+                read = {key: x for key, x in _inputs(base).items() if key.startswith("tasks.")}
+                _write_inputs(run_dir, read)
     before = _settings_of(run_dir, now, defaults)
     for key in sorted(before | now):
         if before.get(key) != now.get(key):
             raise other_setting(run_dir, key, now.get(key), before.get(key))
+    _write_inputs(run_dir, check_files(run_dir, files or {}))
+
+
+def check_files(run_dir: Path, files: Files) -> dict[str, str]:
+    """Compares files with those that a folder's results were made from.
+
+    Args:
+        run_dir: the folder.
+        files: the files by setting. A setting without files, since they are gone, is not compared.
+
+    Returns:
+        the digests of the files.
+
+    Raises:
+        ConfigError: naming the first setting whose files have another content.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> files = {"evaluate.policy": [folder / "policy"]}
+        >>> write_atomic(folder / "policy", "first")
+        >>> open_run(folder / "run", {"seed": 0}, files=files)
+        >>> write_atomic(folder / "policy", "second")
+        >>> check_files(folder / "run", files)
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.ConfigError: ...: the content of evaluate.policy (.../policy) is ...
+    """
+    now, before = (
+        {key: digest_of(*paths) for key, paths in files.items() if paths},
+        _inputs(run_dir),
+    )
+    for key, digest in now.items():
+        if before.get(key, digest) != digest:
+            raise ConfigError(
+                f"{run_dir}: the content of {key} ({files[key][0]}) is {digest[:12]} here and "
+                f"{str(before[key])[:12]} in the folder's run (SHA-256); use the same content to "
+                "continue, or another run_dir"
+            )
+    return now
+
+
+def _inputs(run_dir: Path) -> dict[str, Any]:
+    """Digests of a folder's files by setting; those of earlier versions have none."""
+    path = run_dir / INPUTS
+    found = read_json(path, "digests of files") if path.exists() else {}
+    if not isinstance(found, dict):
+        raise DataError(path, None, f"a {type(found).__name__}; valid: digests by setting")
+    return found
+
+
+def _write_inputs(run_dir: Path, digests: Mapping[str, str]) -> None:
+    """Adds digests to those of a folder."""
+    before = _inputs(run_dir)
+    if digests.keys() - before.keys():
+        write_atomic(run_dir / INPUTS, json.dumps(before | dict(digests), indent=2) + "\n")
 
 
 def _settings_of(

@@ -13,7 +13,7 @@ from typing import Any
 from torchrl_bmrl.errors import FolderInUseError
 from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import write_atomic
-from torchrl_bmrl.run.folder import open_run
+from torchrl_bmrl.run.folder import INPUTS, Files, open_run
 
 with needs("recipes"):
     from filelock import FileLock, Timeout
@@ -66,6 +66,7 @@ def lock_run(
     settings: Mapping[str, Any],
     names: Sequence[str] = ("run",),
     defaults: Mapping[str, Any] | None = None,
+    files: Files | None = None,
 ) -> Iterator[None]:
     """Locks a run folder (:func:`lock`) and opens it (:func:`~torchrl_bmrl.run.folder.open_run`).
 
@@ -77,6 +78,7 @@ def lock_run(
         settings: the resolved configuration.
         names: names of the parts to lock.
         defaults: of the settings, see :func:`~torchrl_bmrl.run.folder.open_run`.
+        files: that decide the results, see there.
 
     Raises:
         BMRLError: the errors of ``lock`` and ``open_run``.
@@ -95,10 +97,10 @@ def lock_run(
     missing = [folder for folder in (run_dir, *run_dir.parents) if not folder.exists()]
     with lock(run_dir, names):
         try:
-            open_run(run_dir, settings, defaults)
+            open_run(run_dir, settings, defaults, files)
             yield
         except Exception:
-            ours = {run_dir / name for name in ("config.yaml", "versions.json")}
+            ours = {run_dir / name for name in ("config.yaml", "versions.json", INPUTS)}
             ours |= {run_dir / ".locks" / f"{name}.{end}" for name in names for end in ENDS}
             new = set(run_dir.rglob("*")) - before
             # Any other file is a result, or another process wrote it.

@@ -30,6 +30,7 @@ from torchrl_bmrl.pipeline.evaluate import evaluate_once
 from torchrl_bmrl.pipeline.learners import loss_options, make_step
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.stage1 import make_policy, sizes_of
+from torchrl_bmrl.pipeline.task_files import check_playable
 from torchrl_bmrl.pipeline.training_data import training_data as stage_1_data
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
@@ -93,13 +94,13 @@ def baselines(run: Run, settings: BaselineSettings) -> str:
             unknown or another one than that of the finished training, or a training diverges.
     """
     run.check_open()
-    run.check_playable()
+    check_playable(run.tasks)
     check_coefficients(settings.coefficients, "baselines.coefficients")
     run.statistics  # noqa: B018 (missing demonstrations are found before anything is written)
     total = settings.updates or stage_1_updates(run)
     names = [name for name in BASELINES if name in settings.algorithms]
     if ONE_HOT in names:
-        run.check_single_actions(f"baselines.algorithms with {ONE_HOT}")
+        run.settings.bcq.check_single_actions(f"baselines.algorithms with {ONE_HOT}")
     coefficients = {name: dict(settings.coefficients.get(name, {})) for name in names}
     trained = [
         (name, task, total, coefficients[name])

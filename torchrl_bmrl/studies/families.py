@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from torchrl_bmrl.data.source_files import files_of
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.families import SPLITS
 from torchrl_bmrl.files import number, or_nothing, read_rows, whole, write_rows
@@ -21,7 +22,7 @@ from torchrl_bmrl.modules.task_latent import check_reads_transitions
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.settings import DistillSettings
 from torchrl_bmrl.pipeline.stage2 import StudentJob, train_student
-from torchrl_bmrl.pipeline.task_files import with_run_options
+from torchrl_bmrl.pipeline.task_files import check_playable, with_run_options
 from torchrl_bmrl.reports import Section, write_study
 from torchrl_bmrl.reports.explorer import StoredExplorer
 from torchrl_bmrl.reports.members import Member, explore_members
@@ -82,7 +83,7 @@ def generalise(run: Run, settings: FamilySettings) -> str:
     run.check_open()
     family, methods = run.family, settings.methods
     members = held_out_members(run)
-    run.check_playable([task for _, task in members])
+    check_playable([*run.tasks, *(task for _, task in members)])
     student, _ = run.student()  # a missing policy is an error before anything is written
     if not reads_context(student.task_encoder):
         check_reads_transitions(student.task_encoder)
@@ -100,7 +101,12 @@ def generalise(run: Run, settings: FamilySettings) -> str:
     ]
     for job in peers:
         job.check()
-    open_run(run.folder / settings.folder, asdict(settings))
+    files = {
+        f"demonstrations of {task.name}": files_of(task.files.path)
+        for _, task in members
+        if task.files is not None
+    }
+    open_run(run.folder / settings.folder, asdict(settings), files=files)
     run.jobs(
         train_student,
         others,

@@ -20,10 +20,10 @@ from torchrl_bmrl.evaluation import rank_correlation
 from torchrl_bmrl.evaluation.fitted_q import estimate_return
 from torchrl_bmrl.files import finite, read_rows, whole, write_rows
 from torchrl_bmrl.modules import BCQPolicy
-from torchrl_bmrl.pipeline.agents import load_bcq_loss
 from torchrl_bmrl.pipeline.learners import Agents
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.stage1 import sizes_of
+from torchrl_bmrl.pipeline.task_files import check_playable
 from torchrl_bmrl.pipeline.training_data import training_data
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
@@ -77,8 +77,8 @@ def fqe(run: Run, settings: FQESettings) -> str:
     if len(series) < 2 or series != sorted(series):
         raise ConfigError(f"fqe.checkpoints is {series}; valid: at least two, from low to high")
     run.check_open()
-    run.check_single_actions("fitted Q evaluation")
-    run.check_playable()
+    run.settings.bcq.check_single_actions("fitted Q evaluation")
+    check_playable(run.tasks)
     run.statistics  # noqa: B018 (missing demonstrations are found before anything is written)
     open_run(run.folder / settings.folder, asdict(settings))
     run.jobs(
@@ -166,7 +166,7 @@ def _evaluate(
 ) -> dict[str, Any]:
     """Computes the estimate and the true return of one agent."""
     keep_freed_memory()
-    loss, _ = load_bcq_loss(_checkpoint(run, name, updates))
+    loss = run.teacher(name, _checkpoint(run, name, updates))
     policy = BCQPolicy.frozen(loss, num_candidates=settings.num_candidates)
     data, bcq = run.transitions(name, "train"), run.settings.bcq
     # The same for all agents of a task, so that only the policies make their estimates differ.

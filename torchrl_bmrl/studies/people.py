@@ -14,6 +14,7 @@ import torch
 from torchrl_bmrl.data import make_mixed_replay_buffer
 from torchrl_bmrl.data.convert import convert, find_format
 from torchrl_bmrl.data.demonstrations import read_demonstrations
+from torchrl_bmrl.data.source_files import files_of
 from torchrl_bmrl.envs.transforms import transform_data
 from torchrl_bmrl.errors import ConfigError, UnknownNameError
 from torchrl_bmrl.evaluation import bootstrap_interval
@@ -25,6 +26,7 @@ from torchrl_bmrl.pipeline.collect import collect
 from torchrl_bmrl.pipeline.evaluate import evaluate_once
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.stage1 import train_agents
+from torchrl_bmrl.pipeline.task_files import check_playable
 from torchrl_bmrl.pipeline.training_data import training_data
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
@@ -70,7 +72,7 @@ def learn_from_people(run: Run, settings: HumanSettings) -> str:
         BMRLError: for demonstrations that cannot be trained on, or if a training diverges.
     """
     run.check_open()
-    run.check_single_actions("this study")
+    run.settings.bcq.check_single_actions("this study")
     if not settings.path:
         raise ConfigError("human.path is empty; valid: a file or folder with demonstrations")
     if settings.task not in run.names:
@@ -87,10 +89,11 @@ def learn_from_people(run: Run, settings: HumanSettings) -> str:
         module, colon, _ = of.rpartition(":")
         tasks = [f"{module}{colon}{settings.task}"]
     alone = Run(replace(run.settings, run_dir=str(folder / "run"), base=None, tasks=tasks))
-    alone.check_playable()
+    check_playable(alone.tasks)
     # More shares and seeds may join the finished ones, with the same demonstrations.
     held = {name: getattr(settings, name) for name in ("path", "task", "tracking")}
-    with lock_run(folder, held):
+    files = {"human.path": files_of(settings.path)}
+    with lock_run(folder, held, files=files):
         _convert(settings, folder / "demonstrations.hdf5")
         with alone:
             collect(alone)
