@@ -60,12 +60,13 @@ def test_the_estimate_is_the_discounted_return_of_the_policy_from_the_starts(
 
 
 def test_a_critic_that_diverges_is_an_error_that_names_the_evaluation() -> None:
-    with pytest.raises(BMRLError, match="of reach, update 1"):
+    with pytest.raises(BMRLError, match="of reach, update 2"):
         estimate_return(
             policy(1, 1, 1),
-            episodes(reward=1e10),
-            updates=1,
+            episodes(),
+            updates=2,
             gamma=0.5,
+            lr=1e20,
             where="fitted Q evaluation of reach",
         )
 
@@ -74,3 +75,8 @@ def test_every_update_is_reported() -> None:
     reported: list[int] = []
     estimate_return(policy(1, 1, 1), episodes(), updates=3, gamma=0.5, report=reported.append)
     assert reported == [1, 1, 1]
+
+
+def test_large_rewards_are_estimated_and_do_not_count_as_divergence() -> None:
+    value = estimate_return(policy(1.0, 1.0, 1.0), episodes(1e5), updates=3, gamma=0.9)
+    assert value == value

@@ -6,7 +6,12 @@ import pytest
 import torch
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.training.health import check_metrics, check_proposals, value_limits
+from torchrl_bmrl.training.health import (
+    check_metrics,
+    check_proposals,
+    largest_metric,
+    value_limits,
+)
 
 WHERE = "bcq lift, update 100"
 
@@ -38,6 +43,14 @@ def test_without_discount_nothing_bounds_values_but_all_metrics_have_a_limit() -
     check_metrics({"pred_value": 1e12}, WHERE, limits)
     with pytest.raises(BMRLError, match="loss_qvalue is 1e\\+09, above 1e\\+08"):
         check_metrics({"loss_qvalue": 1e9}, WHERE, limits)
+
+
+def test_the_limit_of_losses_grows_with_the_square_of_the_rewards() -> None:
+    largest = largest_metric(torch.zeros(2), torch.tensor([[-1e4], [3.0]]))
+    check_metrics({"loss_qvalue": 2e8}, WHERE, largest=largest)
+    with pytest.raises(BMRLError, match="loss_qvalue is 2e\\+16, above 1e\\+16"):
+        check_metrics({"loss_qvalue": 2e16}, WHERE, largest=largest)
+    assert largest_metric(torch.tensor([0.1])) == largest_metric() == 1e8
 
 
 def test_proposals_that_do_not_differ_are_named() -> None:

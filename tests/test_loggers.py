@@ -139,6 +139,33 @@ def test_a_logger_that_cannot_be_made_is_said_and_csv_files_take_its_place(
     assert (tmp_path / "logs" / "bcq_lift" / "scalars" / "loss.csv").read_text() == "10,0.5\n"
 
 
+def test_a_server_that_is_out_of_reach_is_waited_for_once_in_a_run_and_for_seconds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    pytest.importorskip("wandb")
+    import torchrl.record.loggers as theirs
+
+    make, asked = theirs.get_logger, []
+
+    def unreachable(name: str, *arguments: Any, **options: Any) -> Any:
+        if name == "wandb":
+            asked.append(options["wandb_kwargs"]["settings"])
+            raise ConnectionError("context deadline exceeded")
+        return make(name, *arguments, **options)
+
+    monkeypatch.setattr(theirs, "get_logger", unreachable)
+    monkeypatch.setenv("WANDB_MODE", "offline")  # no account is looked for
+    monkeypatch.delenv("WANDB_INIT_TIMEOUT", raising=False)
+    for name in ("bcq_reach", "bcq_lift"):
+        log_metrics(make_logger("wandb", tmp_path / "a", name), {"loss": 0.5}, 10)
+        assert (tmp_path / "a" / "logs" / name / "scalars" / "loss.csv").exists()
+    assert len(caplog.messages) == len(asked) == 1
+    assert asked[0]["init_timeout"] <= 20
+    monkeypatch.setenv("WANDB_INIT_TIMEOUT", "300")
+    make_logger("wandb", tmp_path / "b", "bcq_reach")
+    assert asked[1] == {}  # wandb reads its own variable
+
+
 def test_a_logger_that_fails_later_is_said_once_and_the_run_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -53,6 +53,13 @@ def test_the_size_of_an_action_is_free() -> None:
         assert problems(replace(make_episode(), actions=np.zeros(shape))) == {}
 
 
+@pytest.mark.parametrize("key", ["obs/object", "next_obs/object"])
+def test_observations_beyond_float32_are_refused_with_their_row(key: str) -> None:
+    said = problems(changed(key, 3, -1e300))
+    assert said == {key: "-1e+300 in row 3; valid: at most 3.4e+38, as in float32"}
+    assert problems(changed(key, 3, 3e38)) == {}
+
+
 def test_an_episode_has_at_least_one_step() -> None:
     empty = {key: array[:0] for key, array in arrays_of(make_episode()).items()}
     episode = make_episode()

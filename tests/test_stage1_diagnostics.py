@@ -24,7 +24,7 @@ from helpers import NO_UPDATER
 
 from torchrl_bmrl.pipeline import BCQSettings, EvaluateSettings, Run, Settings, collect, stage1
 from torchrl_bmrl.pipeline.learners import Agents
-from torchrl_bmrl.pipeline.stage1 import sizes_of, train_job
+from torchrl_bmrl.pipeline.stage1 import train_job
 from torchrl_bmrl.training.diagnostics import Diagnostics, diagnose, read_diagnostics
 
 pytestmark = pytest.mark.filterwarnings(NO_UPDATER)
@@ -173,7 +173,7 @@ def test_each_agent_of_a_stack_is_diagnosed_itself_on_demonstrations_of_its_own_
         actions = {tuple(x.tolist()) for x in own["action"]}
         assert {tuple(x.tolist()) for x in data["action"]} <= actions
         assert (params == run.teacher(name).generator_params.to_tensordict()).all()
-        untrained = Agents(run, {name: task}, sizes_of(own)).loss.generator_params
+        untrained = Agents(run, {name: task}, [own]).loss.generator_params
         # Three updates change the parameters little; another agent's are quite different.
         assert ((params - untrained.to_tensordict()).abs() < 0.01).all()
     # Agents of one task differ in their sample.

@@ -17,11 +17,14 @@ pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 pytest.importorskip("yaml")
 
+import numpy as np
 import torch
-from file_runs import file_run, write_demonstrations
+from episode_files import read_file
+from file_edits import edit, put
+from file_runs import TASKS, UPDATES, file_run, write_demonstrations
 from tensordict import TensorDict
 
-from torchrl_bmrl.errors import ConfigError
+from torchrl_bmrl.errors import BMRLError, ConfigError
 from torchrl_bmrl.modules import ActionFlow, ActionMixture, ActionVAE, BCQPolicy, ChunkPolicy
 from torchrl_bmrl.objectives import BCQLoss
 from torchrl_bmrl.pipeline import (
@@ -32,6 +35,7 @@ from torchrl_bmrl.pipeline import (
     stage1,
     stage2,
 )
+from torchrl_bmrl.pipeline.learners import Agents
 from torchrl_bmrl.pipeline.settings import OF_THE_AUTOENCODER
 from torchrl_bmrl.pipeline.stage1 import make_policy
 from torchrl_bmrl.pipeline.training_data import reward_statistics, training_data
@@ -98,6 +102,34 @@ def test_the_learning_rate_of_stage_1_decays_as_a_cosine_or_stays(
     for optimizer in state["optimizers"].values():
         (group,) = optimizer["param_groups"]
         assert float(group["lr"]) == pytest.approx(0.01 * (1 + math.cos(math.pi * share)) / 2)
+
+
+def test_large_rewards_are_no_divergence(tmp_path: Path) -> None:
+    write_demonstrations(tmp_path)
+    for name in TASKS:
+        path = tmp_path / f"{name}.hdf5"
+        for demo, episode in read_file(path).items():
+            edit(path, put(f"data/{demo}/rewards", np.full(len(episode), 1e4)))
+    with file_run(tmp_path) as run:
+        collect(run)
+        stage1(run)
+    _, metadata = load_checkpoint(run.agent_path("door"), kind="bcq")
+    assert metadata["updates"] == UPDATES
+
+
+def test_values_are_bounded_by_rewards_that_a_batch_may_lack(tmp_path: Path) -> None:
+    write_demonstrations(tmp_path)
+    with file_run(tmp_path) as run:
+        collect(run)
+        data = run.transitions("door", "train")
+        sparse = data.copy()
+        sparse["next", "reward"] = torch.zeros_like(data["next", "reward"])
+        sparse["next", "reward"][0] = 100.0
+        agents = Agents(run, {"door": "door"}, [sparse])
+        metrics = {"pred_value": torch.tensor(9e3)}  # of at most 1e4
+        assert agents.check(metrics, sparse[1:5], 1)
+        with pytest.raises(BMRLError, match=r"pred_value is 9e\+04, above 5e\+04"):
+            agents.check({"pred_value": torch.tensor(9e4)}, sparse[1:5], 1)
 
 
 # -- the critics' data -----------------------------------------------------------------------------

@@ -41,7 +41,6 @@ from torchrl_bmrl.pipeline import (
 from torchrl_bmrl.pipeline.evaluate import expert_outcomes
 from torchrl_bmrl.pipeline.held_out import COLUMNS, evaluate_held_out
 from torchrl_bmrl.pipeline.learners import Agents
-from torchrl_bmrl.pipeline.stage1 import sizes_of
 from torchrl_bmrl.pipeline.stage2 import advantage_scale, train_student, value_statistics
 from torchrl_bmrl.pipeline.training_data import training_data
 from torchrl_bmrl.tasks import Task, register_task
@@ -89,7 +88,7 @@ def test_files_without_an_environment_share_the_bounds_of_all_their_actions(tmp_
 
 def test_the_best_agent_is_that_of_the_epoch_with_the_highest_mean_return(trained: Path) -> None:
     run = file_run(trained)
-    agents = Agents(run, {"door-9": "door"}, sizes_of(run.transitions("door", "train")))
+    agents = Agents(run, {"door-9": "door"}, [run.transitions("door", "train")])
     path = run.agent_path("door-9").with_name("best.safetensors")
     for epoch, returns, best in ((1, (0.0, 4.0), 1), (2, (3.0, 0.0), 1), (3, (2.0, 2.0), 3)):
         agents.evaluations["door-9"] += [{"epoch": epoch, "return": x} for x in returns]

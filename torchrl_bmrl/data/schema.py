@@ -127,10 +127,12 @@ def _array_problem(key: str, array: np.ndarray, steps: int, *, trained: bool) ->
     if 0 in array.shape:
         return f"shape {array.shape}; valid: rows of at least one number"
     if array.dtype.kind == "f":
-        # Training uses float32, in which larger numbers are infinite.
-        finite = np.abs(array) <= FLOAT32 if key in ("actions", "rewards") else np.isfinite(array)
+        finite = np.isfinite(array)
         if not finite.all():
             return f"a value that is not finite in row {int(np.argwhere(~finite)[0][0])}"
+        if trained and np.any(large := np.abs(array) > FLOAT32):
+            value, row = array[large].flat[0], int(np.argwhere(large)[0][0])
+            return f"{value:g} in row {row}; valid: at most {FLOAT32:.2g}, as in float32"
     return None
 
 

@@ -14,7 +14,7 @@ from torchrl_bmrl.data import make_replay_buffer
 from torchrl_bmrl.modules import make_qvalue_network
 from torchrl_bmrl.objectives import FQELoss
 from torchrl_bmrl.training.fit import Every, fit
-from torchrl_bmrl.training.health import check_metrics
+from torchrl_bmrl.training.health import check_metrics, largest_metric
 from torchrl_bmrl.training.update import gradient_step, make_adam
 
 
@@ -68,6 +68,7 @@ def estimate_return(
     starts = _with_actions(policy, data[data["step"] == 0])
     data = data.copy().set("next", _with_actions(policy, data["next"]))
     buffer = make_replay_buffer(data, batch_size=batch_size, device=device)
+    largest = largest_metric(data["next", "reward"])
 
     def step(update: int, batch: TensorDictBase) -> dict[str, Tensor]:
         value, metrics = loss.qvalue_loss(batch)
@@ -78,7 +79,7 @@ def estimate_return(
     def check(
         update: int, metrics: dict[str, Tensor], batch: TensorDictBase, logging: bool
     ) -> None:
-        check_metrics(metrics, f"{where}, update {update}")
+        check_metrics(metrics, f"{where}, update {update}", largest=largest)
 
     fit(
         step,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from statistics import fmean
 from typing import Any
 
@@ -26,7 +26,12 @@ from torchrl_bmrl.training.checkpoint import (
     save_checkpoint,
     save_training,
 )
-from torchrl_bmrl.training.health import check_metrics, check_proposals, value_limits
+from torchrl_bmrl.training.health import (
+    check_metrics,
+    check_proposals,
+    largest_metric,
+    value_limits,
+)
 from torchrl_bmrl.training.update import Update, accelerate, decay, gradient_step, make_adam
 
 log = logging.getLogger(__name__)
@@ -52,6 +57,11 @@ NOT_OF_THE_LOSS = (
 def loss_options(settings: BCQSettings) -> dict[str, Any]:
     """Returns the settings that are options of :func:`.make_bcq_loss`."""
     return {name: x for name, x in vars(settings).items() if name not in NOT_OF_THE_LOSS}
+
+
+def sizes_of(data: TensorDictBase) -> dict[str, int]:
+    """Returns the sizes of observation and action, as options of networks."""
+    return {f"{key}_dim": data[key].shape[-1] for key in ("observation", "action")}
 
 
 def make_optimizers(loss: LossModule, settings: BCQSettings) -> dict[str, Adam]:
@@ -121,13 +131,16 @@ class Agents:
     Args:
         run: the run.
         agents: the task of each agent, by the agent's name.
-        sizes: ``observation_dim`` and ``action_dim``.
+        datasets: the transitions of each agent, ``[N_i]``.
     """
 
-    def __init__(self, run: Run, agents: dict[str, str], sizes: dict[str, int]) -> None:
+    def __init__(
+        self, run: Run, agents: dict[str, str], datasets: Sequence[TensorDictBase]
+    ) -> None:
         self.run, self.agents, self.names = run, agents, list(agents)
         settings, self.device = run.settings.bcq, run.settings.device
-        self.options = loss_options(settings) | sizes
+        self.options = loss_options(settings) | sizes_of(datasets[0])
+        self.rewards = [data["next", "reward"] for data in datasets]
         losses = []
         for name in self.names:  # the same initial networks alone and in a stack
             torch.manual_seed(run.seed("bcq", name))
@@ -182,8 +195,9 @@ class Agents:
             mine = batch if self.kind == "bcq" else batch[i]
             where = f"bcq {name}, update {update}"
             try:
-                limits = value_limits(mine["next", "reward"], self.run.settings.bcq.gamma)
-                check_metrics(rows[name], where, limits)
+                limits = value_limits(self.rewards[i], self.run.settings.bcq.gamma)
+                largest = largest_metric(self.rewards[i])
+                check_metrics(rows[name], where, limits, largest=largest)
                 check_proposals(self.proposals(name, mine), mine["action"], where)
             except BMRLError as error:
                 self.diverged[name] = str(error)

@@ -12,9 +12,9 @@ from tensordict.nn import TensorDictModule
 from torchrl_bmrl.data import make_multi_task_replay_buffer
 from torchrl_bmrl.modules import make_reward_models
 from torchrl_bmrl.objectives import RewardModelLoss
+from torchrl_bmrl.pipeline.learners import sizes_of
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.settings import DistillSettings
-from torchrl_bmrl.pipeline.stage1 import sizes_of
 from torchrl_bmrl.pipeline.training import Training, make_update
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.training.update import make_adam
@@ -53,7 +53,15 @@ def train_reward_models(
     loss = RewardModelLoss(models).to(device)
     optimizer = make_adam(loss.parameters(), lr=lr)
     buffer = make_multi_task_replay_buffer(list(datasets), batch_size=batch_size, device=device)
-    training = Training(run, folder, "rewards", models, {"rewards": optimizer}, {"rewards": lr})
+    training = Training(
+        run,
+        folder,
+        "rewards",
+        models,
+        {"rewards": optimizer},
+        {"rewards": lr},
+        rewards=[data["next", "reward"] for data in datasets],
+    )
     training.train(
         make_update(loss, optimizer),
         lambda: buffer.sample().select(*loss.in_keys),

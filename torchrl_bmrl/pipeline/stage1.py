@@ -93,11 +93,6 @@ def train_job(job: tuple[Run, dict[str, str]], report: Report) -> bool:
     return train_agents(run, agents, buffer, report, datasets=datasets)
 
 
-def sizes_of(data: TensorDictBase) -> dict[str, int]:
-    """Returns the sizes of observation and action, as options of networks."""
-    return {f"{key}_dim": data[key].shape[-1] for key in ("observation", "action")}
-
-
 def train_agents(
     run: Run,
     agents: dict[str, str],
@@ -123,7 +118,7 @@ def train_agents(
     """
     keep_freed_memory()
     settings, bcq = run.settings, run.settings.bcq
-    trained = Agents(run, agents, sizes_of(datasets[0]))
+    trained = Agents(run, agents, datasets)
     trained.load()
     if trained.updates:
         log.debug("bcq %s: resumed from update %d", ", ".join(agents), trained.updates)

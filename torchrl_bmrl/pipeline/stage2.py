@@ -21,10 +21,10 @@ from torchrl_bmrl.modules.scales import unmarked
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.objectives import ContextInferenceLoss
 from torchrl_bmrl.pipeline.context_data import ContextSampler
+from torchrl_bmrl.pipeline.learners import sizes_of
 from torchrl_bmrl.pipeline.rewards import models_for_contexts
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.settings import DistillSettings
-from torchrl_bmrl.pipeline.stage1 import sizes_of
 from torchrl_bmrl.pipeline.student import Student, make_distillation_loss
 from torchrl_bmrl.pipeline.training import make_update
 from torchrl_bmrl.pipeline.training_data import deviation
@@ -32,7 +32,7 @@ from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.training.checkpoint import resume_training, save_training
 from torchrl_bmrl.training.fit import Every, fit
-from torchrl_bmrl.training.health import check_metrics, check_proposals
+from torchrl_bmrl.training.health import check_metrics, check_proposals, largest_metric
 from torchrl_bmrl.training.update import (
     accelerate,
     decay,
@@ -211,6 +211,7 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
     sample = make_sampler(run, distill, train)
     if distill.mixing_fraction:
         warn_of_marks(train)
+    largest = largest_metric(*(data["next", "reward"] for data in train))
 
     torch.manual_seed(run.seed("distill"))
     losses = [run.teacher(name) for name in run.names]
@@ -274,7 +275,7 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
         number: int, metrics: dict[str, Tensor], batch: TensorDictBase, logging: bool
     ) -> None:
         where = f"distillation, update {number}"
-        check_metrics(metrics, where)
+        check_metrics(metrics, where, largest=largest)
         some = batch[:, :32]
         proposed = proposals(student, some, teachers[0].latent_clip, settings.device)
         check_proposals(proposed, some["action"], where)

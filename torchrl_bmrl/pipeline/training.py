@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
 from tensordict import TensorDictBase
-from torch import nn
+from torch import Tensor, nn
 from torch.optim import Adam
 
 from torchrl_bmrl.pipeline.run import Run
@@ -17,7 +17,7 @@ from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.training.checkpoint import resume_training, save_training
 from torchrl_bmrl.training.fit import Every, fit
-from torchrl_bmrl.training.health import check_metrics
+from torchrl_bmrl.training.health import check_metrics, largest_metric
 from torchrl_bmrl.training.update import Metrics, Update, accelerate, decay, gradient_step
 
 
@@ -33,6 +33,7 @@ class Training:
         optimizers: of the networks, by name.
         rates: learning rates of the first update; they decay to zero.
         prepare: is given the networks before they are saved, and returns further metadata.
+        rewards: that the losses are made of, of all data; their limit grows with them.
     """
 
     run: Run
@@ -42,6 +43,7 @@ class Training:
     optimizers: Mapping[str, Adam]
     rates: Mapping[str, float]
     prepare: Callable[[Any], dict[str, Any]] = lambda saved: {}
+    rewards: Sequence[Tensor] = ()
 
     def train(
         self, update: Update, sample: Callable[[], TensorDictBase], total: int, report: Report
@@ -66,6 +68,7 @@ class Training:
         report(done)
         if done == total:
             return
+        largest = largest_metric(*self.rewards)
         accelerated = accelerate(
             update,
             compiled=settings.compile,
@@ -79,7 +82,7 @@ class Training:
             return accelerated(batch)
 
         def check(number: int, metrics: Metrics, batch: TensorDictBase, logging: bool) -> None:
-            check_metrics(metrics, f"{self.folder}, update {number}")
+            check_metrics(metrics, f"{self.folder}, update {number}", largest=largest)
             log_metrics(logger if logging else None, metrics, number)
 
         def save(number: int) -> None:

@@ -19,13 +19,15 @@ from torchrl_bmrl.files import write_atomic
 log = logging.getLogger(__name__)
 
 LOGGERS = ("csv", "wandb", "tensorboard", "none")
+INIT_TIMEOUT = 15.0
+"""Longest wait for the server of Weights & Biases [s]; wandb's own default is 90."""
 
 
 def make_logger(kind: str, run_dir: Path, name: str, step: int = 0) -> Any:
     """Returns one of TorchRL's loggers, which writes under ``run_dir/logs``.
 
     If a logger cannot be created, for example without a connection to its server, a warning is
-    logged and the CSV logger is used instead.
+    logged and the CSV logger is used instead. This process then does not try again for that folder.
 
     Args:
         kind: ``"csv"``, ``"wandb"``, ``"tensorboard"`` or ``"none"``.
@@ -55,11 +57,12 @@ def make_logger(kind: str, run_dir: Path, name: str, step: int = 0) -> Any:
     from torchrl.record.loggers import get_logger
 
     folder = run_dir / "logs"
-    if kind != "csv":
+    if kind != "csv" and (kind, folder) not in _unavailable:
         try:
             options = {"wandb_kwargs": _wandb_options(run_dir, name)} if kind == "wandb" else {}
             return get_logger(kind, str(folder), name, **options)
         except Exception as error:  # servers and their libraries raise errors of any type
+            _unavailable.add((kind, folder))
             reason = _first_line(error)
             log.warning(
                 f"{name}: {kind} is not available ({reason}); metrics go to CSV files in {folder}"
@@ -84,6 +87,7 @@ def _wandb_options(run_dir: Path, name: str) -> dict[str, Any]:
         "id": _wandb_id(run_dir / "logs" / name / "wandb_id"),
         # By default wandb uses the process's first run for every logger.
         "reinit": "create_new",
+        "settings": {} if "WANDB_INIT_TIMEOUT" in os.environ else {"init_timeout": INIT_TIMEOUT},
     }
 
 
@@ -151,6 +155,8 @@ def close_logger(logger: Any) -> None:
         log.warning(f"the last metrics may be missing ({_first_line(error)})")
 
 
+_unavailable: set[tuple[str, Path]] = set()
+"""Kinds of loggers that could not be made, with their folders: each attempt takes its time."""
 _lost: WeakSet[Any] = WeakSet()
 """Loggers that failed."""
 

@@ -27,9 +27,9 @@ from torchrl_bmrl.modules import BCQPolicy, PrototypeTaskLatent
 from torchrl_bmrl.pipeline.agents import load_bcq_loss, make_bcq_loss
 from torchrl_bmrl.pipeline.evaluate import evaluate_job as evaluate_stages
 from torchrl_bmrl.pipeline.evaluate import evaluate_once
-from torchrl_bmrl.pipeline.learners import loss_options, make_step
+from torchrl_bmrl.pipeline.learners import loss_options, make_step, sizes_of
 from torchrl_bmrl.pipeline.run import Run
-from torchrl_bmrl.pipeline.stage1 import make_policy, sizes_of
+from torchrl_bmrl.pipeline.stage1 import make_policy
 from torchrl_bmrl.pipeline.task_files import check_playable
 from torchrl_bmrl.pipeline.training_data import training_data as stage_1_data
 from torchrl_bmrl.reports.page import Section
@@ -50,7 +50,7 @@ from torchrl_bmrl.studies.algorithms import (
 from torchrl_bmrl.studies.baselines_report import make_paired_table, make_table
 from torchrl_bmrl.training.checkpoint import load_newest, resume_training, save_training
 from torchrl_bmrl.training.fit import Every, fit
-from torchrl_bmrl.training.health import check_metrics
+from torchrl_bmrl.training.health import check_metrics, largest_metric
 from torchrl_bmrl.training.update import decay, gradient_step, keep_freed_memory, make_adam
 
 ONE_HOT = "bcq_one_hot"
@@ -339,6 +339,7 @@ def train_job(job: tuple[Run, tuple[str, str, int, Coefficients]], report: Repor
     keep_freed_memory()
     settings, learner = run.settings, Learner(run, algorithm, task, coefficients)
     buffer = make_buffer(run, algorithm, task, coefficients)
+    largest = largest_metric(buffer[:]["next", "reward"])
     learner.load()  # last, since everything above draws random numbers
     if learner.updates:
         report(learner.updates)
@@ -353,7 +354,7 @@ def train_job(job: tuple[Run, tuple[str, str, int, Coefficients]], report: Repor
         def check(
             update: int, metrics: dict[str, Tensor], batch: TensorDictBase, logging: bool
         ) -> None:
-            check_metrics(metrics, f"{learner.name}, update {update}")
+            check_metrics(metrics, f"{learner.name}, update {update}", largest=largest)
             log_metrics(logger if logging else None, metrics, update)
 
         keys = [*learner.loss.in_keys, STEPS_KEY, ("next", STEPS_KEY)]

@@ -29,9 +29,9 @@ from torchrl_bmrl.modules import (
     make_reward_models,
 )
 from torchrl_bmrl.objectives import FOCALLoss, MBMLLoss
+from torchrl_bmrl.pipeline.learners import sizes_of
 from torchrl_bmrl.pipeline.rewards import train_reward_models
 from torchrl_bmrl.pipeline.run import Run
-from torchrl_bmrl.pipeline.stage1 import sizes_of
 from torchrl_bmrl.pipeline.stage2 import value_statistics
 from torchrl_bmrl.pipeline.student import Student
 from torchrl_bmrl.pipeline.training import Training, make_update
@@ -260,7 +260,8 @@ def _train_focal(run: Run, peer: PeerJob, report: Report) -> None:
         saved.set_prototypes(own)
         return {"focal": options}
 
-    training = Training(run, peer.folder, "focal", module, optimizers, rates, prepare)
+    rewards = [each["next", "reward"] for each in data]
+    training = Training(run, peer.folder, "focal", module, optimizers, rates, prepare, rewards)
     training.train(update, sample, focal.updates, report)
 
 
@@ -323,9 +324,8 @@ def _train_mbml(run: Run, peer: PeerJob, report: Report) -> None:
             "accuracy": None,
         }
 
-    training = Training(
-        run, peer.folder, "student", student, optimizers, {"student": mbml.lr}, prepare
-    )
+    rates, rewards = {"student": mbml.lr}, [each["next", "reward"] for each in data]
+    training = Training(run, peer.folder, "student", student, optimizers, rates, prepare, rewards)
     training.train(
         make_update(loss, optimizers["student"]),
         lambda: buffer.sample().select(*loss.in_keys),

@@ -22,7 +22,6 @@ from torchrl_bmrl.files import finite, read_rows, whole, write_rows
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.pipeline.learners import Agents
 from torchrl_bmrl.pipeline.run import Run
-from torchrl_bmrl.pipeline.stage1 import sizes_of
 from torchrl_bmrl.pipeline.task_files import check_playable
 from torchrl_bmrl.pipeline.training_data import training_data
 from torchrl_bmrl.reports.page import Section
@@ -122,7 +121,7 @@ def train_job(job: tuple[Run, tuple[str, list[int]]], report: Report) -> None:
     settings = run.settings
     (data,) = training_data([run.transitions(name, "train")], settings.bcq)
     buffer = make_replay_buffer(data, batch_size=settings.bcq.batch_size, device=settings.device)
-    agents = Agents(run, {name: name}, sizes_of(data))
+    agents = Agents(run, {name: name}, [data])
     step = agents.make_step(series[-1])
 
     def check(

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl_bmrl.errors import BMRLError
 
 LARGEST = 1e8
-"""A loss or metric above this value means that the training has diverged."""
+"""A loss or metric above this value means that the training has diverged, with rewards up to 1."""
 EXPLODED = 5.0
 """Values above this multiple of the largest possible return mean that the critic has diverged."""
 DEAD = 1e-5
@@ -21,11 +21,27 @@ SATURATED = 0.99
 _SAVED = "the last checkpoint stays"
 
 
+def largest_metric(*rewards: Tensor) -> float:
+    """Returns the bound on losses and metrics: :data:`LARGEST` times the square of the rewards.
+
+    Critics' losses are squares of rewards, or of sums of them.
+
+    Args:
+        *rewards: of all data; the largest counts, or 1 if it is below that.
+
+    Example:
+        >>> import torch
+        >>> largest_metric(torch.tensor([0.5, -10.0]))
+        10000000000.0
+    """
+    return LARGEST * max([1.0, *(reward.abs().max().item() for reward in rewards)]) ** 2
+
+
 def value_limits(reward: Tensor, gamma: float) -> dict[str, float]:
     """Returns bounds of a critic's metrics: :data:`EXPLODED` times the largest possible return.
 
     Args:
-        reward: rewards of a batch.
+        reward: rewards of all data; a batch of sparse rewards may have none.
         gamma: discount factor; with 1 there is no bound.
 
     Example:
@@ -33,20 +49,25 @@ def value_limits(reward: Tensor, gamma: float) -> dict[str, float]:
         >>> value_limits(torch.tensor([0.0, 2.0]), gamma=0.5)
         {'pred_value': 20.0, 'next_state_value': 20.0}
     """
-    largest = max(1.0, reward.abs().max().item())  # a batch with sparse rewards may have none
+    largest = max(1.0, reward.abs().max().item())
     limit = EXPLODED * largest / (1 - gamma) if gamma < 1 else math.inf
     return {"pred_value": limit, "next_state_value": limit}
 
 
 def check_metrics(
-    metrics: Mapping[str, Any], where: str, limits: Mapping[str, float] | None = None
+    metrics: Mapping[str, Any],
+    where: str,
+    limits: Mapping[str, float] | None = None,
+    *,
+    largest: float = LARGEST,
 ) -> None:
     """Raises an error if a loss or value is not finite or too large.
 
     Args:
         metrics: scalars by name.
         where: the training and the update, for the message.
-        limits: bounds on the absolute value of some metrics; :data:`LARGEST` bounds the others.
+        limits: bounds on the absolute value of some metrics.
+        largest: bound on the others, see :func:`largest_metric`.
 
     Raises:
         BMRLError: naming the first such metric.
@@ -58,7 +79,7 @@ def check_metrics(
         torchrl_bmrl.errors.BMRLError: bcq lift, update 100: pred_value is 900, above 500; ...
     """
     for name, value in metrics.items():
-        number, limit = float(value), (limits or {}).get(name, LARGEST)
+        number, limit = float(value), (limits or {}).get(name, largest)
         if not math.isfinite(number):
             raise BMRLError(f"{where}: {name} is {number}; {_SAVED}; try a lower learning rate")
         if abs(number) > limit:
