@@ -132,6 +132,26 @@ def test_a_worker_without_a_handler_of_its_own_is_ended_by_its_parent(tmp_path: 
     assert code == -15
 
 
+STARTING = """
+import os, signal, sys, time
+from multiprocessing import forkserver
+from torchrl_bmrl.run.forked import start_server
+
+start_server()
+server = forkserver._forkserver._forkserver_pid
+os.kill(server, getattr(signal, sys.argv[1]))
+time.sleep(1.0)
+print(os.waitpid(server, os.WNOHANG)[0] == 0)
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_signals_to_all_processes_leave_alone_a_server_that_starts(name: str) -> None:
+    command = [sys.executable, "-c", STARTING, name]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("True\n", "")
+
+
 @pytest.mark.parametrize(
     ("arguments", "beside", "starts"),
     [

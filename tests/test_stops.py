@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from torchrl_bmrl.errors import ConfigError, FolderInUseError, StoppedError
+from torchrl_bmrl.run import stops
 from torchrl_bmrl.run.command_line import exit_codes
 from torchrl_bmrl.run.stops import check_stop, stop_on_signals
 
@@ -42,11 +43,21 @@ def test_a_signal_stops_at_the_next_point_and_not_before(number: signal.Signals)
     check_stop()  # it is over
 
 
-def test_a_second_signal_interrupts_at_once() -> None:
+def test_a_later_signal_interrupts_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stops, "REPEATS", 0.0)
     with stop_on_signals():
         signal.raise_signal(signal.SIGTERM)
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize("second", SIGNALS)
+def test_signals_that_come_together_are_one_request(second: signal.Signals) -> None:
+    with stop_on_signals():
+        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(second)
+        with pytest.raises(StoppedError, match="stopped by SIGTERM; finished work is saved"):
+            check_stop()
 
 
 def test_handlers_are_put_back_and_what_was_ignored_stays_ignored() -> None:

@@ -13,6 +13,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
+from multiprocessing import resource_tracker
 
 METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 """How worker processes are started."""
@@ -44,13 +45,27 @@ def start_server(*modules: str) -> None:
 
     own = [name for name in sys.modules if name.partition(".")[0] in PACKAGES]
     forkserver.set_forkserver_preload(["torchrl_bmrl.run.forked_server"])
-    with _inherited(IMPORTS, " ".join(dict.fromkeys([*own, *modules]))), one_thread():
-        # Blocked until the server ignores them: a Ctrl-C now must not end it.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, FOR_THE_RUN)
-        try:
-            forkserver.ensure_running()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    imports = " ".join(dict.fromkeys([*own, *modules]))
+    with _inherited(IMPORTS, imports), one_thread(), held_signals():
+        forkserver.ensure_running()
+
+
+@contextmanager
+def held_signals() -> Iterator[None]:
+    """Holds signals back from the processes that start inside, until these have their handlers.
+
+    Until then Python would end a process with a traceback.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, FOR_THE_RUN)
+    try:
+        resource_tracker.ensure_running()  # with the first process; it unblocks signals here
+        signal.pthread_sigmask(signal.SIG_BLOCK, FOR_THE_RUN)
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def one_thread() -> AbstractContextManager[None]:

@@ -4,25 +4,34 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 from torchrl_bmrl.errors import StoppedError
+from torchrl_bmrl.run.forked import FOR_THE_RUN
 
+REPEATS = 1.0
+"""Seconds in which further signals are the same request.
+
+A closed terminal sends SIGHUP twice, ``timeout`` SIGTERM, and systemd SIGTERM and SIGHUP.
+"""
 _asked: signal.Signals | None = None
+_when = 0.0  # of the first signal
 
 
 def note_signal(number: int, frame: FrameType | None = None) -> None:
-    """Signal handler: the next :func:`check_stop` raises; a second signal raises at once.
+    """Signal handler: the next :func:`check_stop` raises; a second request raises at once.
 
     Raises:
-        KeyboardInterrupt: at the second signal.
+        KeyboardInterrupt: at a signal more than :data:`REPEATS` seconds after the first.
     """
-    global _asked
-    if _asked is not None:
+    global _asked, _when
+    if _asked is None:
+        _asked, _when = signal.Signals(number), time.monotonic()
+    elif time.monotonic() - _when > REPEATS:
         raise KeyboardInterrupt
-    _asked = signal.Signals(number)
 
 
 def stop_worker_on_signals() -> None:
@@ -36,10 +45,10 @@ def stop_worker_on_signals() -> None:
         global _asked
         _asked = signal.Signals(number)
 
-    signal.signal(signal.SIGTERM, note)
-    for name in ("SIGINT", "SIGHUP"):
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    for each in FOR_THE_RUN:
+        signal.signal(each, note if each == signal.SIGTERM else signal.SIG_IGN)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, FOR_THE_RUN)  # held back since the start
 
 
 def check_stop() -> None:
@@ -75,10 +84,8 @@ def stop_on_signals() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    numbers += [signal.SIGHUP] if hasattr(signal, "SIGHUP") else []
     # Ignored signals stay ignored: nohup and background jobs of a shell ignore some.
-    numbers = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
+    numbers = [each for each in FOR_THE_RUN if signal.getsignal(each) is not signal.SIG_IGN]
     before = {number: signal.signal(number, note_signal) for number in numbers}
     _asked = None
     try:

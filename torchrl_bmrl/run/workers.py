@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 import torch
 
 from torchrl_bmrl.errors import BMRLError, StoppedError
-from torchrl_bmrl.run.forked import METHOD, one_thread, start_server
+from torchrl_bmrl.run.forked import METHOD, held_signals, one_thread, start_server
 from torchrl_bmrl.run.logs import LOGGER
 from torchrl_bmrl.run.progress import Progress, progress
 from torchrl_bmrl.run.stops import check_stop, stop_worker_on_signals
@@ -41,7 +41,12 @@ work catches that error, saves the work and raises it again.
 TRIES = 3
 """How often a job is started before the run fails, if its worker dies each time."""
 SILENCE = 900.0
-"""Seconds without a report after which a worker counts as hung; compiling can take minutes."""
+"""Seconds without a report after which a worker counts as hung; compiling can take minutes.
+
+Only seconds in which this process waits for reports count: not those of a suspended job.
+"""
+PATIENCE = 1.0
+"""Seconds of one wait for reports."""
 GRACE = 60.0
 """Seconds that workers have to save their work when a run stops."""
 
@@ -103,6 +108,7 @@ def run_jobs(
     jobs = list(jobs)
     if not jobs:
         return []
+    check_stop()
     with progress(total, description, unit) as bar:
         if min(workers, len(jobs)) <= 1:
 
@@ -130,15 +136,16 @@ class _Worker:
         level = LOGGER.getEffectiveLevel()
         arguments = (theirs, function, level, dict(os.environ))
         self.process = context.Process(target=_serve, args=arguments, daemon=True)
-        self.process.start()
+        with held_signals():
+            self.process.start()
         theirs.close()  # so that the process's end closes the pipe
         self.job = -1  # number of the job
         self.units = 0  # units that the job has reported
-        self.last_message = time.monotonic()
+        self.silence = 0.0  # seconds that this process has waited for a message of it
         self.hangs = False
 
     def begin(self, number: int, job: Any) -> None:
-        self.job, self.units, self.last_message = number, 0, time.monotonic()
+        self.job, self.units, self.silence = number, 0, 0.0
         self._send(("job", job))
 
     def end(self) -> None:
@@ -151,7 +158,7 @@ class _Worker:
             self.connection.send(message)
 
     def kill_if_it_hangs(self) -> None:
-        if time.monotonic() - self.last_message > SILENCE:
+        if self.silence > SILENCE:
             self.hangs = True
             self.process.kill()
 
@@ -198,6 +205,7 @@ def _serve(
         if kind == "end":
             return
         try:
+            check_stop()  # the signal may have come while this worker started
             connection.send(("result", function(job, report)))
         except StoppedError:
             return
@@ -228,14 +236,12 @@ def _run_in_processes(
             while waiting and len(pool) < workers:
                 pool.append(_Worker(function))
                 pool[-1].begin(number := waiting.popleft(), jobs[number])
-            by_connection: dict[Any, _Worker] = {worker.connection: worker for worker in pool}
-            ready = wait(list(by_connection), timeout=1.0)
+            ready, _ = _wait(pool)
             check_stop()
             for worker in pool:
                 worker.kill_if_it_hangs()
-            for connection in ready:
-                worker = by_connection[connection]
-                number, worker.last_message = worker.job, time.monotonic()
+            for worker in ready:
+                number = worker.job
                 try:
                     kind, value = worker.connection.recv()
                 except (EOFError, OSError):
@@ -270,16 +276,44 @@ def _run_in_processes(
                         worker.process.join()
         return [results[number] for number in range(len(jobs))]
     finally:
+        _end(pool)
+
+
+def _wait(pool: Sequence[_Worker]) -> tuple[list[_Worker], float]:
+    """Waits for messages; returns the workers that sent one, and how long this waited [s].
+
+    A pause of this process (Ctrl-Z, a suspended laptop) hardly counts, and ends with the messages
+    that were sent meanwhile.
+    """
+    began = time.monotonic()
+    found = wait([worker.connection for worker in pool], timeout=PATIENCE)
+    waited = min(time.monotonic() - began, PATIENCE)
+    ready = [worker for worker in pool if worker.connection in found]
+    for worker in pool:
+        worker.silence = 0.0 if worker in ready else worker.silence + waited
+    return ready, waited
+
+
+def _end(pool: Sequence[_Worker]) -> None:
+    """Ends workers; to save their work they have :data:`GRACE` seconds."""
+    for worker in pool:
+        worker.end()
+    left, open_ = GRACE, list(pool)
+    try:
+        while open_ and left > 0:
+            ready, waited = _wait(open_)
+            left -= waited
+            for worker in ready:  # a worker whose messages nobody reads waits, and saves nothing
+                try:
+                    worker.connection.recv_bytes()
+                except (EOFError, OSError):
+                    open_.remove(worker)
         for worker in pool:
-            worker.end()
-        end = time.monotonic() + GRACE
-        try:
-            for worker in pool:
-                worker.process.join(max(0.0, end - time.monotonic()))
-        finally:  # a second signal interrupts the wait
-            for worker in pool:
-                worker.process.kill()
-                worker.process.join()
+            worker.process.join(max(0.0, left))
+    finally:  # a second signal interrupts the wait
+        for worker in pool:
+            worker.process.kill()
+            worker.process.join()
 
 
 def _death(worker: _Worker) -> str:
