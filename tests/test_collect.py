@@ -20,11 +20,12 @@ from observations import OBSERVATION_SHAPES
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import open_episodes, read_kept_episode
 from torchrl_bmrl.envs.skills import SKILLS
-from torchrl_bmrl.errors import ConfigError, DataError, UnknownNameError
+from torchrl_bmrl.errors import ConfigError, DataError, FolderInUseError, UnknownNameError
 from torchrl_bmrl.experts import collect
 from torchrl_bmrl.experts.collect import _EpisodeJob, collect_demonstrations
 from torchrl_bmrl.experts.controllers import EXPERTS
 from torchrl_bmrl.experts.tabletop import make_task
+from torchrl_bmrl.run.locks import lock
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.tasks import DemonstrationFiles, Task
 
@@ -76,7 +77,8 @@ def read(path: Path) -> list[Episode]:
 
 
 def files(directory: Path) -> list[str]:
-    return sorted(str(p.relative_to(directory)) for p in directory.rglob("*") if p.is_file())
+    every = [path.relative_to(directory) for path in directory.rglob("*") if path.is_file()]
+    return sorted(str(path) for path in every if ".locks" not in path.parts)
 
 
 def test_a_collection_is_one_file_per_task(collected: dict[str, Path]) -> None:
@@ -295,3 +297,26 @@ def test_what_cannot_be_recorded_is_refused_before_anything_is_written(tmp_path:
             tmp_path, [door], {"door": 1}, valid_episodes=1, noise=0.0, seed=0, workers=1
         )
     assert files(tmp_path) == []
+
+
+def test_what_another_process_records_is_refused_and_nothing_else(
+    tmp_path: Path, collected: dict[str, Path]
+) -> None:
+    with lock(tmp_path / ".episodes", ["lift"]):
+        with pytest.raises(FolderInUseError):
+            run(tmp_path)
+        assert files(tmp_path) == []
+        assert run(tmp_path, {"reach": 2})["reach"].exists()
+    run(collected["lift"].parent)  # complete: without a lock
+
+
+@pytest.mark.parametrize("linked", [".episodes", ".episodes/lift"])
+def test_no_folder_is_removed_through_a_link(tmp_path: Path, linked: str) -> None:
+    agent = tmp_path / "bcq" / "lift" / "checkpoint.safetensors"
+    agent.parent.mkdir(parents=True)
+    agent.touch()
+    (tmp_path / "data" / linked).parent.mkdir(parents=True)
+    (tmp_path / "data" / linked).symlink_to(tmp_path / "bcq")
+    with pytest.raises(DataError, match=r"is a link to .*bcq"):
+        run(tmp_path / "data", {"lift": 1})
+    assert agent.exists()

@@ -16,8 +16,8 @@ import pytest
 pytest.importorskip("filelock")
 pytest.importorskip("yaml")
 
-from torchrl_bmrl.errors import FolderInUseError
-from torchrl_bmrl.run.locks import lock
+from torchrl_bmrl.errors import DataError, FolderInUseError
+from torchrl_bmrl.run.locks import lock, lock_run
 
 HOLDING = """
 import sys
@@ -74,3 +74,31 @@ def test_a_damaged_note_of_the_owner_still_refuses(tmp_path: Path) -> None:
         (tmp_path / ".locks" / "run.json").write_text("{")
         with pytest.raises(FolderInUseError, match="process unknown"), lock(tmp_path):
             pass
+
+
+# -- links -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("linked", ["data", "data/.episodes", "bcq/lift", ".locks", "logs"])
+def test_a_run_that_would_change_another_folder_through_a_link_is_refused(
+    tmp_path: Path, linked: str
+) -> None:
+    other, run = tmp_path / "other", tmp_path / "run"
+    (other / "lift").mkdir(parents=True)
+    (run / linked).parent.mkdir(parents=True, exist_ok=True)
+    (run / linked).symlink_to(other, target_is_directory=True)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(DataError, match="is a link to ") as caught, lock_run(run, {"seed": 0}):
+        pass
+    assert caught.value.path == run / linked
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_links_that_no_file_is_changed_through_stay(tmp_path: Path) -> None:
+    (tmp_path / "real" / "wandb" / "offline-run-1").mkdir(parents=True)
+    (tmp_path / "real" / "wandb" / "latest-run").symlink_to("offline-run-1")
+    (tmp_path / "stored").write_text("seed: 0\n")  # as a cache of downloads does
+    (tmp_path / "real" / "config.yaml").symlink_to(tmp_path / "stored")
+    (tmp_path / "run").symlink_to(tmp_path / "real")
+    with lock_run(tmp_path / "run", {"seed": 0}):
+        pass

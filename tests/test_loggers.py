@@ -210,3 +210,16 @@ def test_rows_after_the_step_that_a_run_goes_on_from_are_dropped_and_torn_ones(
     for step in (30, 40):
         log_metrics(logger, {"loss": step / 4}, step)
     assert path.read_text() == whole + "40,10.0\n"
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_rows_are_appended_to_no_file_that_a_run_has_a_link_to(tmp_path: Path, there: bool) -> None:
+    path, other = tmp_path / "run/logs/bcq_lift/scalars/loss.csv", tmp_path / "other.csv"
+    path.parent.mkdir(parents=True)
+    path.symlink_to(other)
+    if there:
+        other.write_text("10,2.5\n")
+    logger = make_logger("csv", tmp_path / "run", "bcq_lift", step=10)
+    log_metrics(logger, {"loss": 5.0}, 20)
+    assert path.read_text() == "10,2.5\n" * there + "20,5.0\n"
+    assert (other.read_text() if other.exists() else "") == "10,2.5\n" * there

@@ -178,6 +178,34 @@ def digest_of(*paths: Path) -> str:
     return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()
 
 
+def check_no_linked_folders(folder: str | os.PathLike[str]) -> None:
+    """Checks that no folder inside of a folder is a link: files elsewhere would change through it.
+
+    Files may be links, because they are replaced and never modified. The folders ``wandb`` are left
+    out: Weights & Biases links its newest run.
+
+    Args:
+        folder: The folder, which may be a link itself, or missing.
+
+    Raises:
+        DataError: naming the first link.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> (folder / "bcq").symlink_to(tempfile.mkdtemp())
+        >>> check_no_linked_folders(folder)
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.DataError: .../bcq: is a link to /...; valid: a folder, ...
+    """
+    for path in sorted(Path(folder).rglob("*")):
+        inside = path.relative_to(folder).parts[:-1]
+        if path.is_symlink() and path.is_dir() and "wandb" not in inside:
+            message = f"is a link to {path.resolve()}; valid: a folder, as files would change there"
+            raise DataError(path, None, message)
+
+
 def read_json(path: str | os.PathLike[str], what: str) -> Any:
     """Reads a JSON file.
 

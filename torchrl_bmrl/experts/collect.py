@@ -6,6 +6,7 @@ import inspect
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ from torchrl_bmrl.data.robomimic import (
 )
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
 from torchrl_bmrl.experts.settings import Experts, ExpertSettings, experts_of
+from torchrl_bmrl.files import check_no_linked_folders
+from torchrl_bmrl.run.locks import lock
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
 from torchrl_bmrl.tasks import Task, get_task
 
@@ -97,7 +100,9 @@ def collect_demonstrations(
         ConfigError: for a task without ``record``, or with one that takes no ``like`` if there are
             ``context_episodes``, and for invalid ``experts``.
         UnknownNameError: for a name in ``after`` that is not a task.
-        DataError: if an existing file has another number of episodes.
+        DataError: if an existing file has another number of episodes, or a folder in ``directory``
+            is a link.
+        FolderInUseError: if another process records some of the tasks.
         StoppedError: if the run is stopped; finished episodes are saved.
 
     Example:
@@ -136,60 +141,67 @@ def collect_demonstrations(
             )
     own = {name: episodes[name] + valid_episodes for name in by_name}
     counts = {name: number + context_episodes for name, number in own.items()}
-    parts = {
-        name: [directory / ".episodes" / name / f"{i:05d}.npz" for i in range(counts[name])]
-        for name, path in files.items()
-        if not path.exists()
-    }
-    jobs = [
-        _EpisodeJob(
-            task=by_name[name],
-            seed=derive_seed(seed, "collect", name, i),
-            path=path,
-            expert=chosen[name][i % len(chosen[name])],
-            after=befores[name][i % len(befores[name])],
-            like=() if i < own[name] else others_than(tasks, name, seed=derive_seed(seed, name, i)),
-        )
-        for name, paths in parts.items()
-        for i, path in enumerate(paths)
-        if not path.exists()
-    ]
-    # Jobs with equal scenes follow each other, since a worker reuses its last scene.
-    order = list(by_name)
-    jobs.sort(key=lambda job: (order.index(job.task.name), [task.name for task in job.after]))
-    run_jobs(
-        _collect_job,
-        jobs,
-        workers=workers,
-        total=len(jobs),
-        description="collecting demonstrations",
-        unit="episode",
-        preload=[task.simulator for task in tasks if task.simulator],
-    )
-    for name, paths in parts.items():
-        first, count = read_kept_episode(paths[0]), len(chosen[name])
-        masks = {
-            "train": range(episodes[name]),
-            "valid": range(episodes[name], own[name]),
-            **({"context": range(own[name], counts[name])} if context_episodes else {}),
+    check_no_linked_folders(directory)
+    missing = [name for name, path in files.items() if not path.exists()]
+    with ExitStack() as held:
+        if missing:
+            held.enter_context(lock(directory / ".episodes", missing))
+        parts = {
+            name: [directory / ".episodes" / name / f"{i:05d}.npz" for i in range(counts[name])]
+            for name in missing
+            if not files[name].exists()  # another process may have written it until now
         }
-        write_episodes(
-            files[name],
-            (
-                _prepare(read_kept_episode(path), None if count == 1 else i % count)
-                for i, path in enumerate(paths)
-            ),
-            masks={**masks, **({} if count == 1 else _expert_masks(masks, count))},
-            env_args=first.attributes.get("env_args", {}),
-            attributes={
-                "task": name,
-                "action_noise": chosen[name][0].noise if count == 1 else noise,
-                "seed": seed,
-                **_entries(changes.get(name, changes.get("default"))),
-            },
+        jobs = [
+            _EpisodeJob(
+                task=by_name[name],
+                seed=derive_seed(seed, "collect", name, i),
+                path=path,
+                expert=chosen[name][i % len(chosen[name])],
+                after=befores[name][i % len(befores[name])],
+                like=()
+                if i < own[name]
+                else others_than(tasks, name, seed=derive_seed(seed, name, i)),
+            )
+            for name, paths in parts.items()
+            for i, path in enumerate(paths)
+            if not path.exists()
+        ]
+        # Jobs with equal scenes follow each other, since a worker reuses its last scene.
+        order = list(by_name)
+        jobs.sort(key=lambda job: (order.index(job.task.name), [task.name for task in job.after]))
+        run_jobs(
+            _collect_job,
+            jobs,
+            workers=workers,
+            total=len(jobs),
+            description="collecting demonstrations",
+            unit="episode",
+            preload=[task.simulator for task in tasks if task.simulator],
         )
-        # The whole folder: a killed process may have left temporary files in it.
-        shutil.rmtree(directory / ".episodes" / name)
+        for name, paths in parts.items():
+            first, count = read_kept_episode(paths[0]), len(chosen[name])
+            masks = {
+                "train": range(episodes[name]),
+                "valid": range(episodes[name], own[name]),
+                **({"context": range(own[name], counts[name])} if context_episodes else {}),
+            }
+            write_episodes(
+                files[name],
+                (
+                    _prepare(read_kept_episode(path), None if count == 1 else i % count)
+                    for i, path in enumerate(paths)
+                ),
+                masks={**masks, **({} if count == 1 else _expert_masks(masks, count))},
+                env_args=first.attributes.get("env_args", {}),
+                attributes={
+                    "task": name,
+                    "action_noise": chosen[name][0].noise if count == 1 else noise,
+                    "seed": seed,
+                    **_entries(changes.get(name, changes.get("default"))),
+                },
+            )
+            # The whole folder: a killed process may have left temporary files in it.
+            shutil.rmtree(directory / ".episodes" / name)
     for name, path in files.items():
         if count_episodes(path) != counts[name]:
             raise DataError(

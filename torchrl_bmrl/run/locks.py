@@ -12,7 +12,7 @@ from typing import Any
 
 from torchrl_bmrl.errors import FolderInUseError
 from torchrl_bmrl.extras import needs
-from torchrl_bmrl.files import write_atomic
+from torchrl_bmrl.files import check_no_linked_folders, write_atomic
 from torchrl_bmrl.run.folder import INPUTS, Files, open_run
 
 with needs("recipes"):
@@ -81,6 +81,7 @@ def lock_run(
         files: that decide the results, see there.
 
     Raises:
+        DataError: if a folder in the run folder is a link.
         BMRLError: the errors of ``lock`` and ``open_run``.
 
     Example:
@@ -93,6 +94,7 @@ def lock_run(
         ...     folder.parent.exists()
         False
     """
+    check_no_linked_folders(run_dir)
     before = set(run_dir.rglob("*"))
     missing = [folder for folder in (run_dir, *run_dir.parents) if not folder.exists()]
     with lock(run_dir, names):
@@ -103,6 +105,7 @@ def lock_run(
             ours = {run_dir / name for name in ("config.yaml", "versions.json", INPUTS)}
             ours |= {run_dir / ".locks" / f"{name}.{end}" for name in names for end in ENDS}
             new = set(run_dir.rglob("*")) - before
+            ours |= set(run_dir.glob("*/**/.locks/*"))
             # Any other file is a result, or another process wrote it.
             if {path for path in new if not path.is_dir()} <= ours:
                 _remove(new, missing)

@@ -68,9 +68,10 @@ def make_logger(kind: str, run_dir: Path, name: str, step: int = 0) -> Any:
                 f"{name}: {kind} is not available ({reason}); metrics go to CSV files in {folder}"
             )
     for path in (folder / name / "scalars").glob("*.csv"):
-        rows = path.read_text(encoding="utf-8").splitlines(keepends=True)
+        text = path.read_text(encoding="utf-8") if path.is_file() else ""
+        rows = text.splitlines(keepends=True)
         kept = [row for row in rows if row.endswith("\n") and _step(row) <= step]
-        if kept != rows:
+        if kept != rows or path.is_symlink():  # rows are appended, here and not to another file
             write_atomic(path, "".join(kept))
     return get_logger("csv", str(folder), name)
 
