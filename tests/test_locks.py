@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import socket
@@ -10,6 +11,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -101,4 +103,25 @@ def test_links_that_no_file_is_changed_through_stay(tmp_path: Path) -> None:
     (tmp_path / "real" / "config.yaml").symlink_to(tmp_path / "stored")
     (tmp_path / "run").symlink_to(tmp_path / "real")
     with lock_run(tmp_path / "run", {"seed": 0}):
+        pass
+
+
+def test_a_lock_empties_no_file_that_it_is_a_link_to(tmp_path: Path) -> None:
+    (tmp_path / ".locks").mkdir()
+    (tmp_path / "other").write_text("content")
+    (tmp_path / ".locks" / "run.lock").symlink_to(tmp_path / "other")
+    with pytest.raises(OSError, match=r"run\.lock"), lock(tmp_path):
+        pass
+    assert (tmp_path / "other").read_text() == "content"
+
+
+@pytest.mark.filterwarnings("ignore:flock not supported")
+def test_a_disk_without_flock_has_locks_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fcntl = pytest.importorskip("fcntl")
+    monkeypatch.setattr(fcntl, "flock", Mock(side_effect=OSError(errno.ENOSYS, "no flock")))
+    with lock(tmp_path / "new"), pytest.raises(FolderInUseError), lock(tmp_path / "new"):
+        pass
+    with lock(tmp_path / "new"):  # it was given back
         pass
