@@ -34,7 +34,7 @@ def read_options(arguments: list[str] | None = None) -> argparse.Namespace:
 def main(arguments: list[str] | None = None) -> None:
     """Command line."""
     options = read_options(arguments)
-    with exit_codes():
+    with exit_codes(saves=False):
         for name, table in combine(options.runs).items():
             if options.out:
                 write_atomic(options.out / f"{name}.md", table.markdown())

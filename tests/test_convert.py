@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import shutil
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from torchrl_bmrl.data.__main__ import main
 from torchrl_bmrl.data.convert import convert, find_format, open_source
 from torchrl_bmrl.data.datasets import RobomimicExperienceReplay
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError, UnknownNameError
+from torchrl_bmrl.run.progress import Lines
 
 HUMAN = Path(__file__).parents[2] / "shared/data/human_sawyer_lift/demo.hdf5"
 FLOAT32 = {name: (shape, np.float32) for name, (shape, _) in TASK_PARTS.items()}
@@ -34,6 +36,28 @@ FLOAT32 = {name: (shape, np.float32) for name, (shape, _) in TASK_PARTS.items()}
 def path(tmp_path: Path) -> Path:
     write_file(tmp_path / "lift.hdf5", parts=TASK_PARTS)
     return tmp_path / "lift.hdf5"
+
+
+@pytest.mark.usefixtures("signals_not_ignored")
+@pytest.mark.parametrize("command", ["check", "convert"])
+def test_a_signal_ends_a_command_at_once_and_leaves_nothing(
+    path: Path, command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    read: list[float] = []
+
+    class Bar(Lines):
+        def update(self, n: float = 1) -> None:
+            read.append(n)
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr("torchrl_bmrl.data.__main__.progress", lambda *args, **_: Bar(*args))
+    out = [str(path.with_name("out.hdf5")), "--to", "robomimic"] if command == "convert" else []
+    with pytest.raises(SystemExit) as end:
+        main([command, str(path), *out])
+    assert end.value.code == 128 + signal.SIGTERM
+    assert len(read) == 1
+    assert "saved" not in capsys.readouterr().err
+    assert list(path.parent.iterdir()) == [path]
 
 
 def spoil(path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 
 pytest.importorskip("tqdm")
 
-from torchrl_bmrl.run.forked import METHOD
+from torchrl_bmrl.run.forked import FOR_THE_RUN, METHOD, held_signals
 
 pytestmark = [
     pytest.mark.slow,
@@ -150,6 +151,18 @@ def test_signals_to_all_processes_leave_alone_a_server_that_starts(name: str) ->
     command = [sys.executable, "-c", STARTING, name]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("True\n", "")
+
+
+def test_a_process_that_starts_gets_its_signals_when_it_is_ready() -> None:
+    script = "import time; print('ready', flush=True); time.sleep(0.3); print('done')"
+    with held_signals():
+        process = subprocess.Popen(
+            [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+    assert not signal.pthread_sigmask(signal.SIG_BLOCK, []) & set(FOR_THE_RUN)
+    for number in FOR_THE_RUN:
+        process.send_signal(number)
+    assert process.communicate() == (b"ready\ndone\n", b"")
 
 
 @pytest.mark.parametrize(

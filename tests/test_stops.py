@@ -126,6 +126,49 @@ def test_what_may_be_expected_is_one_line_and_an_exit_code(
     assert said.count("\n") == 1
 
 
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_command_that_saves_nothing_before_its_end_stops_at_once_and_says_so(
+    number: signal.Signals, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done = []
+
+    def work() -> None:
+        try:
+            signal.raise_signal(number)
+            done.append("more")
+        finally:
+            signal.raise_signal(number)  # a repeat leaves the cleaning up alone
+            done.append("cleaned up")
+
+    with pytest.raises(SystemExit) as end, exit_codes(saves=False):
+        work()
+    assert done == ["cleaned up"]
+    assert end.value.code == 128 + number
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device", "a"), MemoryError()])
+def test_a_command_that_saves_nothing_before_its_end_promises_nothing(
+    error: Exception, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit), exit_codes(saves=False):
+        raise error
+    assert "saved" not in capsys.readouterr().err
+
+
+def test_a_signal_after_the_last_unit_of_work_is_an_exit_code_as_well() -> None:
+    with pytest.raises(SystemExit) as end, exit_codes():
+        signal.raise_signal(signal.SIGINT)
+    assert end.value.code == 130
+
+
+def test_an_interrupt_before_a_command_starts_is_one_line() -> None:
+    script = "import torchrl_bmrl.run.as_command, signal; signal.raise_signal(signal.SIGINT)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == -signal.SIGINT
+    assert done.stderr == "interrupted\n"
+
+
 def test_a_mistake_of_the_program_keeps_its_traceback() -> None:
     with pytest.raises(ZeroDivisionError), exit_codes():
         raise ZeroDivisionError

@@ -311,6 +311,7 @@ def test_stopped_while_workers_start_that_import_for_themselves_no_traceback_is_
     def interrupt() -> None:
         while len(children := multiprocessing.active_children()) < 2:
             time.sleep(0.01)
+        time.sleep(2.0)  # they import
         for pid in (*(child.pid for child in children), os.getpid()):
             os.kill(pid or 0, signal.SIGINT)
 

@@ -293,7 +293,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.check and (options.runs or options.baselines):
         parser.error("--check takes no runs")
-    with exit_codes():
+    with exit_codes(saves=False):
         if options.check:
             check_results_page(options.docs)
             check_weak_page(options.docs)

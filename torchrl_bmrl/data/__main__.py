@@ -218,7 +218,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parts.add_argument("--fps", type=float, help="steps per second, if not the source's")
     parts.set_defaults(run=convert_command)
     options = parser.parse_args(arguments)
-    with exit_codes():
+    with exit_codes(saves=False):
         return options.run(options)
 
 

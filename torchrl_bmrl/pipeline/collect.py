@@ -24,6 +24,7 @@ from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.experts.collect import collect_demonstrations
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.run.progress import progress
+from torchrl_bmrl.run.stops import check_stop
 from torchrl_bmrl.tasks import Task
 
 READ_NONE = "distill.context=set distill.inference_updates=0 distill.reward_updates=0"
@@ -114,6 +115,7 @@ def _import_files(run: Run) -> None:
                 target.unlink()
                 raise
             bar.update(1)
+            check_stop()
 
 
 def read_episode(run: Run, task: Task, index: int, *, context: bool = False) -> Episode:

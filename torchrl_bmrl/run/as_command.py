@@ -1,4 +1,4 @@
-"""Prints errors that this library raises at import as one line; commands import this first.
+"""Prints errors at import, and an interrupt, as one line; commands import this first.
 
 :func:`torchrl_bmrl.run.command_line.exit_codes` handles errors after the imports.
 """
@@ -16,6 +16,8 @@ def _print_error(
 ) -> None:
     if isinstance(error, BMRLError):
         print(f"error: {error}", file=sys.stderr, flush=True)
+    elif isinstance(error, KeyboardInterrupt):  # Python then ends as SIGINT does
+        print("interrupted", file=sys.stderr, flush=True)
     else:
         _default(kind, error, trace)
 

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from types import FrameType
 
 from torchrl_bmrl.errors import StoppedError
@@ -21,17 +22,24 @@ _asked: signal.Signals | None = None
 _when = 0.0  # of the first signal
 
 
-def note_signal(number: int, frame: FrameType | None = None) -> None:
+def note_signal(number: int, frame: FrameType | None = None, *, at_once: bool = False) -> None:
     """Signal handler: the next :func:`check_stop` raises; a second request raises at once.
 
+    Args:
+        number: the signal.
+        frame: not used.
+        at_once: whether the first request raises as well.
+
     Raises:
-        KeyboardInterrupt: at a signal more than :data:`REPEATS` seconds after the first.
+        KeyboardInterrupt: with the signal's number; not at a signal within :data:`REPEATS` seconds
+            after the first.
     """
     global _asked, _when
-    if _asked is None:
-        _asked, _when = signal.Signals(number), time.monotonic()
-    elif time.monotonic() - _when > REPEATS:
-        raise KeyboardInterrupt
+    now, first = time.monotonic(), _asked is None
+    if first:
+        _asked, _when = signal.Signals(number), now
+    if at_once if first else now - _when > REPEATS:
+        raise KeyboardInterrupt(number)
 
 
 def stop_worker_on_signals() -> None:
@@ -71,10 +79,14 @@ def check_stop() -> None:
 
 
 @contextmanager
-def stop_on_signals() -> Iterator[None]:
+def stop_on_signals(*, at_once: bool = False) -> Iterator[None]:
     """Makes Ctrl-C, SIGTERM and SIGHUP stop the block at its next :func:`check_stop`.
 
     Does nothing outside the main thread, since only that thread may handle signals.
+
+    Args:
+        at_once: ``True`` for a block that saves nothing before its end: the signals raise
+            ``KeyboardInterrupt``.
 
     Example:
         >>> with stop_on_signals():
@@ -86,7 +98,8 @@ def stop_on_signals() -> Iterator[None]:
         return
     # Ignored signals stay ignored: nohup and background jobs of a shell ignore some.
     numbers = [each for each in FOR_THE_RUN if signal.getsignal(each) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, note_signal) for number in numbers}
+    note = partial(note_signal, at_once=at_once)
+    before = {number: signal.signal(number, note) for number in numbers}
     _asked = None
     try:
         yield

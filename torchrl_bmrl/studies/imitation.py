@@ -35,6 +35,7 @@ from torchrl_bmrl.reports import Section, Table, write_study
 from torchrl_bmrl.run.folder import open_run
 from torchrl_bmrl.run.progress import progress
 from torchrl_bmrl.run.settings import setting
+from torchrl_bmrl.run.stops import check_stop
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.tasks import Task
 
@@ -89,6 +90,7 @@ def imitate(run: Run, settings: ImitateSettings) -> str:
         for number in range(settings.demonstrations):
             demonstrate(run, task, number)
             bar.update(1)
+            check_stop()
     jobs = [
         (settings, method, perturbation, number)
         for method in METHODS

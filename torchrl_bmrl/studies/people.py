@@ -34,6 +34,7 @@ from torchrl_bmrl.reports.tables import MISSING, Table
 from torchrl_bmrl.run.locks import lock_run
 from torchrl_bmrl.run.progress import progress
 from torchrl_bmrl.run.settings import setting
+from torchrl_bmrl.run.stops import check_stop
 from torchrl_bmrl.run.workers import Report
 
 log = logging.getLogger(__name__)
@@ -125,13 +126,18 @@ def _convert(settings: HumanSettings, path: Path) -> None:
         return
     raw = find_format(Path(settings.path)) == "robosuite"
     with progress(None, "converting", "episode") as bar:
+
+        def report(episodes: int) -> None:
+            bar.update(episodes)
+            check_stop()
+
         done = convert(
             settings.path,
             path,
             to="robomimic",
             task=settings.task if raw else None,
             tracking=settings.tracking if raw else 1.0,
-            report=bar.update,
+            report=report,
         )
     for note in done.notes:
         log.warning("%s: %s", settings.path, note)
