@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,16 @@ import torch
 from checkpoint_files import checkpoint_path, same
 from helpers import NO_UPDATER
 from tensordict import TensorDict
+from torch import nn
 
 pytest.importorskip("safetensors")
 
 from torchrl_bmrl.errors import CheckpointError
 from torchrl_bmrl.modules import BCQPolicy
-from torchrl_bmrl.pipeline.agents import load_bcq_loss, make_bcq_loss
-from torchrl_bmrl.pipeline.student import Student, load_student
+from torchrl_bmrl.pipeline.agents import GENERATORS, load_bcq_loss, make_bcq_loss
+from torchrl_bmrl.pipeline.student import TASK_ENCODERS, Student, load_student
 from torchrl_bmrl.training.checkpoint import save_checkpoint
+from torchrl_bmrl.training.networks import build
 
 SMALL = {"num_cells": [8], "observation_dim": 3, "action_dim": 2}
 STUDENT = {**SMALL, "num_tasks": 3, "latent_dim": 4}
@@ -115,6 +118,48 @@ def test_settings_of_no_networks_are_refused_before_any_are_made(
     with pytest.raises(CheckpointError, match=match) as info:
         load_bcq_loss(path)
     assert info.value.path == path
+
+
+@pytest.mark.parametrize("held", [torch.zeros(0, 3000), torch.zeros(1, 3000)])
+def test_no_memory_is_taken_for_networks_that_the_file_s_tensors_do_not_fill(
+    path: Path, held: torch.Tensor
+) -> None:
+    made = []
+
+    def make(**options: int) -> nn.Module:
+        made.append(nn.Linear(options["width"], options["width"]))
+        return made[-1]
+
+    with pytest.raises(CheckpointError, match=r"no tensor in the file|has shape|is missing"):
+        build(make, {"width": 3000}, {"module": {"weight": held}}, path)
+    assert all(module.weight.is_meta for module in made)
+
+
+def test_networks_of_more_parts_than_can_be_built_in_time_are_refused(path: Path) -> None:
+    state = {"module": {str(i): torch.zeros(1) for i in range(2000)}}
+    options = {"observation_dim": 1, "action_dim": 1, "num_cells": [1] * 2000}
+    save_checkpoint(path, state, {"kind": "bcq", "loss": options})
+    with pytest.raises(CheckpointError, match="more than 2000 weights and biases"):
+        load_bcq_loss(path)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        *(partial(make_bcq_loss, generator=name, perturbation=True) for name in GENERATORS),
+        *(partial(Student, num_tasks=3, task_encoder=name, infers=True) for name in TASK_ENCODERS),
+    ],
+)
+def test_networks_have_the_same_shapes_on_the_meta_device_where_they_are_checked(make: Any) -> None:
+    options = {**SMALL, "num_cells": [8]}
+    with torch.device("meta"):
+        meant = make(**options).state_dict()
+    real = make(**options).state_dict()
+    assert list(meant) == list(real)
+    for key, tensor in real.items():
+        if isinstance(tensor, torch.Tensor):
+            assert meant[key].shape == tensor.shape
+            assert meant[key].is_meta
 
 
 @pytest.mark.parametrize(

@@ -345,8 +345,9 @@ def check_bounds(bounds: Any, network: Any, size: int | None = None) -> None:
         >>> check_bounds((-1.0, 1.0), ActionVAE(3, 2))
     """
     own = getattr(network, "bounds", None) or bounds
+    own = bounds if torch.as_tensor(own[0]).is_meta else own  # on the meta device: no numbers
     for name, bound, other in zip(("lower", "upper"), bounds, own, strict=True):
-        bound, other = (torch.as_tensor(x).double().cpu() for x in (bound, other))
+        bound, other = (torch.as_tensor(x, device="cpu").double() for x in (bound, other))
         if size is not None and bound.ndim and len(bound) != size:
             raise BMRLError(
                 f"the {name} bound of the action has {len(bound)} numbers; valid: a number, or "

@@ -330,12 +330,13 @@ def action_bounds(
         if not isinstance(action_spec, Bounded):
             raise BMRLError(f"action_spec is a {type(action_spec).__name__}; valid: Bounded")
         bounds = (action_spec.space.low, action_spec.space.high)
-    # Numbers in float64: in a float64 loss 0.4 must not become 0.4 in float32.
+    # Numbers in float64: in a float64 loss 0.4 must not become 0.4 in float32. And on the CPU: on
+    # the meta device, where networks may be built for their shapes, they could not be checked.
     low, high = (
         bound
         if isinstance(bound, Tensor) and bound.is_floating_point()
         else torch.as_tensor(
-            list(bound) if isinstance(bound, Sequence) else bound, dtype=torch.float64
+            list(bound) if isinstance(bound, Sequence) else bound, dtype=torch.float64, device="cpu"
         )
         for bound in bounds
     )

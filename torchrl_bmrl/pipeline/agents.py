@@ -17,7 +17,8 @@ from torchrl_bmrl.modules import (
     make_qvalue_network,
 )
 from torchrl_bmrl.objectives import BCQLoss
-from torchrl_bmrl.training.checkpoint import build, load_checkpoint
+from torchrl_bmrl.training.checkpoint import load_checkpoint
+from torchrl_bmrl.training.networks import build
 
 _SIX_TASKS = {"observation_dim": 33, "action_dim": 7}
 """Sizes of older checkpoints, which do not contain them."""

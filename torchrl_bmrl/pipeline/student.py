@@ -34,7 +34,8 @@ from torchrl_bmrl.modules.context_encoder import ContextNetwork
 from torchrl_bmrl.objectives import MetaDistillationLoss
 from torchrl_bmrl.pipeline.agents import with_sizes
 from torchrl_bmrl.pipeline.metadata import are_statistics, is_number, is_task_name
-from torchrl_bmrl.training.checkpoint import build, load_checkpoint
+from torchrl_bmrl.training.checkpoint import load_checkpoint
+from torchrl_bmrl.training.networks import build
 
 
 class Student(nn.Module):

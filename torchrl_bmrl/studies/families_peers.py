@@ -38,7 +38,8 @@ from torchrl_bmrl.pipeline.training import Training, make_update
 from torchrl_bmrl.pipeline.training_data import deviation
 from torchrl_bmrl.run.settings import setting
 from torchrl_bmrl.run.workers import Report
-from torchrl_bmrl.training.checkpoint import build, load_checkpoint
+from torchrl_bmrl.training.checkpoint import load_checkpoint
+from torchrl_bmrl.training.networks import build
 from torchrl_bmrl.training.update import (
     Metrics,
     gradient_step,

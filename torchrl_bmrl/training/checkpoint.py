@@ -6,9 +6,9 @@ import hashlib
 import json
 import logging
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import tensordict
 import torch
@@ -231,6 +231,12 @@ def load_state(module: nn.Module, state: Mapping[str, Tensor], path: Path) -> No
         ...
         torchrl_bmrl.errors.CheckpointError: a.safetensors: 'weight' has shape (1, 3); valid ...
     """
+    check_shapes(module, state, path)
+    module.load_state_dict(dict(state))
+
+
+def check_shapes(module: nn.Module, state: Mapping[str, Tensor], path: Path) -> None:
+    """Compares names and shapes as :func:`load_state` does, which also works on the meta device."""
     own = module.state_dict()
     if not isinstance(state, Mapping):
         raise CheckpointError(path, f"contains {type(state).__name__}; valid: parameters by name")
@@ -246,45 +252,6 @@ def load_state(module: nn.Module, state: Mapping[str, Tensor], path: Path) -> No
                 path,
                 f"{key!r} has shape {shape}; valid for these networks: {tuple(own[key].shape)}",
             )
-    module.load_state_dict(dict(state))
-
-
-Built = TypeVar("Built", bound=nn.Module)
-
-
-def build(make: Callable[..., Built], options: Any, state: Mapping[str, Any], path: Path) -> Built:
-    """Builds the frozen networks of a checkpoint.
-
-    Args:
-        make: builds the networks.
-        options: keyword arguments of ``make``, from the checkpoint's metadata.
-        state: state of the checkpoint, with the parameters under ``module``.
-        path: path of the checkpoint, for the message.
-
-    Raises:
-        CheckpointError: if ``make`` refuses the options, or the parameters do not fit the networks
-            or are not finite.
-    """
-    params = state.get("module")
-    if not isinstance(options, dict) or not isinstance(params, dict):
-        raise CheckpointError(path, "contains no networks; valid: the checkpoint of a module")
-    # The file decides how much memory the networks take: no size may exceed those of its tensors.
-    tensors = [value for value in params.values() if isinstance(value, Tensor)]
-    largest = max((size for tensor in tensors for size in tensor.shape), default=0)
-    for name, option in options.items():
-        sizes = option if isinstance(option, list) else [option]
-        whole = [size for size in sizes if isinstance(size, int)]
-        if len(sizes) > len(tensors) or any(abs(size) > largest for size in whole):
-            raise CheckpointError(path, f"{name} is {option}; no tensor in the file is that large")
-    try:
-        module = make(**options)
-    except (AttributeError, RuntimeError, TypeError, ValueError) as error:
-        raise CheckpointError(path, f"its options build no networks ({error})") from error
-    load_state(module, params, path)
-    for key, tensor in params.items():
-        if not tensor.isfinite().all():
-            raise CheckpointError(path, f"{key!r} contains numbers that are not finite")
-    return module.requires_grad_(False)
 
 
 def save_training(
