@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -71,6 +72,9 @@ class Flat:
         keys = ["actions", "terminals", *parts.values(), *after.values()]
         keys += [key for key in ("rewards", "timeouts") if key in present]
         steps = _check_lengths(path, file, keys)
+        # Every step may end an episode, and no step of real numbers takes less than a byte.
+        if steps > 2**12 + os.path.getsize(path):
+            raise DataError(path, "actions", f"claims {steps} steps, more than the file can hold")
         for part in after:
             _check_alike(path, file, parts[part], after[part])
         extras, further = _find_extras(path, file, present, steps)

@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ VERSION = ("v110", "v110")
 by the version that wrote it."""
 DAMAGE = (OSError, RuntimeError, KeyError, TypeError, ValueError, MemoryError)
 """Errors that h5py raises on a damaged file, depending on where the damage is."""
+_MOST_LINKS = 16
+"""Soft links that one key may lead through."""
 
 
 def open_file(path: str | Path) -> h5py.File:
@@ -97,6 +100,12 @@ def read_node(path: str | Path, file: h5py.File, key: str) -> Any:
         return _within(path, file, key)
 
 
+def capacity(path: str | Path, stored: int | None = None) -> int:
+    """Largest number of bytes that decompressing a file, or that many bytes of it, can yield."""
+    # gzip compresses zeros to about a thousandth, and nothing to less.
+    return 2**20 + 1100 * os.path.getsize(path) if stored is None else 1100 * stored
+
+
 def _within(path: str | Path, file: h5py.File, key: str) -> Any:
     """A node whose content lies in this file and is not larger than the file can hold.
 
@@ -104,19 +113,59 @@ def _within(path: str | Path, file: h5py.File, key: str) -> Any:
         DataError: if it is damaged, lies in another file, or claims more bytes than decompressing
             this file can yield.
     """
+    names = _refuse_links_out(path, file, key)
     node = file.get(key)
     # h5py returns the same for a missing node and for one that it cannot open.
     if node is None and isinstance(file.get(key, getlink=True), h5py.HardLink):
         raise DataError(path, key, "unreadable: it is there, and damaged")
-    if node is not None and node.file.id != file.id:
-        raise DataError(path, key, f"lies in {node.file.filename}; valid: in this file")
     if isinstance(node, h5py.Dataset):
         if node.external or node.is_virtual:
             raise DataError(path, key, "its content lies in other files; valid: in this file")
-        # gzip compresses zeros to about a thousandth, and nothing to less.
-        if node.nbytes > 2**20 + 1100 * os.path.getsize(path):
-            raise DataError(path, key, f"claims {node.nbytes} bytes, more than the file can hold")
+        # Rows that were never written take no space. An array with several names is read as often.
+        written = os.path.getsize(path) + 2**16 + capacity(path, node.id.get_storage_size())
+        times = prod(h5py.h5o.get_info(file.id, name).rc for name in names)
+        if node.nbytes > written or times * node.nbytes > capacity(path):
+            often = f" under {times} names" if times > 1 else ""
+            message = f"claims {node.nbytes} bytes{often}, more than the file can hold"
+            raise DataError(path, key, message)
     return node
+
+
+def _refuse_links_out(path: str | Path, file: h5py.File, key: str) -> list[bytes]:
+    """Follows a key link by link, because HDF5 itself opens the file that a link names.
+
+    Returns:
+        keys of the groups on the way and of the node, without soft links.
+
+    Raises:
+        DataError: for a link to another file, and for more links than a path has.
+    """
+    names, done, links = _parts_of(key), b"", 0
+    passed: list[bytes] = []
+    while names:
+        here = done + b"/" + names.pop(0)
+        try:
+            kind = file.id.links.get_info(here).type
+        except DAMAGE:  # missing or damaged, as whoever opens it will find, too
+            break
+        if kind == h5py.h5l.TYPE_HARD:
+            done = here
+            passed.append(here)
+        elif kind == h5py.h5l.TYPE_SOFT and links < _MOST_LINKS:
+            links += 1
+            target = file.id.links.get_val(here)
+            names = [*_parts_of(target), *names]
+            done = b"" if target.startswith(b"/") else done
+        else:
+            where = f"lies in {_text(file.id.links.get_val(here)[0])}"
+            where = "a link to itself" if kind == h5py.h5l.TYPE_SOFT else where
+            raise DataError(path, key, f"{where}; valid: in this file")
+    return passed
+
+
+def _parts_of(key: str | bytes) -> list[bytes]:
+    whole = key.encode("utf-8", "surrogateescape") if isinstance(key, str) else key
+    return [part for part in whole.split(b"/") if part not in (b"", b".")]
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
@@ -152,11 +201,28 @@ def read_strings(path: str | Path, file: h5py.File, key: str) -> list[str]:
     """Reads the strings of a dataset, bytes or text.
 
     Raises:
-        DataError: if it is missing, a group, or cannot be read.
+        DataError: if it is missing, a group, or cannot be read, or claims more texts than the file
+            can hold.
     """
     with _reading(path, key):
         node = _dataset(path, file, key)
-        return [_text(value) for value in np.asarray(node[()]).reshape(-1)]
+        size = os.path.getsize(path)
+        # Each text names an episode, whose group alone takes more.
+        if node.size is None or node.size > 2**10 + size // 64:
+            message = f"claims {node.size} texts, more than the file can name"
+            raise DataError(path, key, message)
+        if not node.dtype.hasobject or not node.ndim:
+            return [_text(value) for value in np.asarray(node[()]).reshape(-1)]
+        # Texts of variable length lie elsewhere in the file, and many rows may name the same.
+        texts: list[str] = []
+        left, step = 2**20 + size, max(1, 2**24 // size)
+        for start in range(0, len(node), step):
+            more = [_text(value) for value in np.asarray(node[start : start + step]).reshape(-1)]
+            left -= sum(map(len, more))
+            if left < 0:
+                raise DataError(path, key, "its texts are longer than the file")
+            texts += more
+        return texts
 
 
 def _dataset(path: str | Path, file: h5py.File, key: str) -> h5py.Dataset:
@@ -173,7 +239,9 @@ def read_attributes(path: str | Path, file: h5py.File, key: str) -> dict[str, An
         DataError: if they cannot be read.
     """
     with _reading(path, key, "attributes "):
-        return {name: _plain(value) for name, value in file[key].attrs.items()}
+        _refuse_links_out(path, file, key)
+        held = file[key].attrs
+        return {name: _attribute(path, key, held, name) for name in held}
 
 
 def read_attribute(path: str | Path, file: h5py.File, key: str, name: str) -> Any:
@@ -183,7 +251,19 @@ def read_attribute(path: str | Path, file: h5py.File, key: str, name: str) -> An
         DataError: if it cannot be read.
     """
     with _reading(path, key, f"attribute {name} "):
-        return _plain(file[key].attrs.get(name))
+        _refuse_links_out(path, file, key)
+        held = file[key].attrs
+        return _attribute(path, key, held, name) if name in held else None
+
+
+def _attribute(path: str | Path, key: str, held: h5py.AttributeManager, name: str) -> Any:
+    stored = held.get_id(name)
+    count = prod(stored.shape or ())
+    # HDF5 reads all at once, and each of them may be the same text, as long as the file.
+    if stored.dtype.hasobject and count > 64 and count * os.path.getsize(path) > 2**26:
+        message = f"attribute {name} has {count} texts of any length; valid: of a fixed length"
+        raise DataError(path, key, message)
+    return _plain(held[name])
 
 
 def has_rows(node: Any, *counts: int) -> bool:

@@ -161,7 +161,13 @@ def _read_table(path: Path, name: str) -> list[dict[str, Any]]:
             present = [
                 key for key in parquet.schema_arrow.names if key in keys or key.startswith("data/")
             ]
-            rows += parquet.read(columns=present).to_pylist()
+            left = 2**22 + 32 * file.stat().st_size
+            # A text that is stored once may be that of many rows.
+            for batch in parquet.iter_batches(batch_size=64, columns=present):
+                left -= batch.nbytes
+                if left < 0:
+                    raise DataError(file, None, "its rows are longer than the file can hold")
+                rows += batch.to_pylist()
     return _ordered(rows)
 
 
@@ -183,9 +189,21 @@ def open_parquet(file: Path) -> Iterator[Any]:
         from pyarrow.parquet import ParquetFile
     try:
         with ParquetFile(file, page_checksum_verification=True) as parquet:
+            _check_size(file, parquet.metadata)
             yield parquet
     except DataError:
         raise
     except (pa.ArrowException, OSError, ValueError, KeyError, OverflowError) as error:
         reason = str(error).strip().partition("\n")[0]
         raise DataError(file, None, f"not a whole parquet file ({reason})") from error
+
+
+def _check_size(file: Path, metadata: Any) -> None:
+    """Refuses a file of more rows or numbers than its bytes can hold; equal ones take none."""
+    size, rows = file.stat().st_size, metadata.num_rows
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    values = sum(group.column(i).num_values for group in groups for i in range(group.num_columns))
+    # Each row has its own index, and a number takes 8 bytes at most.
+    if rows > 2**12 + size or 8 * values > 2**20 + 1100 * size:
+        message = f"claims {rows} rows and {values} values, more than the file can hold"
+        raise DataError(file, None, message)

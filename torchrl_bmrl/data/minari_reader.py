@@ -97,7 +97,7 @@ def _oddities(
     steps = 0
     for name in names:
         try:
-            count = len(file[f"{name}/actions"])
+            count = len(read_node(path, file, f"{name}/actions"))
             attributes = read_attributes(path, file, name)
             for key, value in (("id", _number(name)), ("total_steps", count)):
                 if (told := attributes.get(key, value)) != value:

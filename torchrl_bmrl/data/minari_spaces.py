@@ -7,13 +7,14 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torchrl_bmrl.data.arrays import refuse_pointer
-from torchrl_bmrl.data.hdf5 import DAMAGE, read_array, read_node
+from torchrl_bmrl.data.hdf5 import DAMAGE, capacity, read_array, read_node
 from torchrl_bmrl.data.schema import FLOAT32
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.extras import needs
@@ -170,6 +171,9 @@ def is_jpeg(node: Any) -> bool:
 
 def _decode(path: Path, key: str, node: h5py.Dataset, space: Space) -> np.ndarray:
     images = []
+    if (claimed := len(node) * prod(space.shape)) > capacity(path):
+        message = f"claims {claimed} bytes of images, more than the file can hold"
+        raise DataError(path, key, message)
     for i, image in enumerate(_open_images(path, key, node)):
         # Before decoding, which may take much memory.
         if _shape(image) != _drop_ones(space.shape):
@@ -185,13 +189,14 @@ def _decode(path: Path, key: str, node: h5py.Dataset, space: Space) -> np.ndarra
 def _open_images(path: Path, key: str, node: h5py.Dataset) -> Iterator[Any]:
     with needs("data"):
         from PIL import Image
-    try:
-        rows = node[()]
-    except DAMAGE as error:
-        raise DataError(path, key, f"unreadable ({error})") from error
-    for i, row in enumerate(rows):
+    for i in range(len(node)):
         try:
-            image = Image.open(io.BytesIO(row.tobytes()))
+            row = np.asarray(node[i])  # one at a time: all may be the same, as long as the file
+        except DAMAGE as error:
+            raise DataError(path, key, f"unreadable ({error})") from error
+        try:
+            # Minari writes JPEG. Decoders of other formats may read other files or start programs.
+            image = Image.open(io.BytesIO(row.tobytes()), formats=["JPEG"])
         except (*DAMAGE, SyntaxError, Image.DecompressionBombError) as error:
             raise DataError(path, key, f"no JPEG in row {i} ({error})") from error
         yield image

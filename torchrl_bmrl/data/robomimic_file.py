@@ -111,8 +111,8 @@ def count_steps(
         for name in episodes:
             key = f"data/{name}/actions"
             try:
-                whole = "next_obs" in file[f"data/{name}"]
-                total += len(file[key]) if whole else 0
+                whole = "next_obs" in read_names(path, file, f"data/{name}")
+                total += len(read_node(path, file, key)) if whole else 0
             except DAMAGE as error:
                 raise DataError(path, key, f"missing or unreadable ({error})") from error
             total += 0 if whole else len(episodes[name])
