@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_bmrl.envs.compiling import check_assets, compile_scene, end_with_parent
 from torchrl_bmrl.errors import BMRLError, RenderError
 from torchrl_bmrl.extras import needs
 
@@ -29,6 +30,17 @@ GOAL_MARKER = "goal_marker"
 
 _CONTEXTS = ("egl", "osmesa", "glfw")
 """Modules of mujoco with a GL context; the names are also values of ``MUJOCO_GL``."""
+_START = f"""
+import sys
+from importlib.util import module_from_spec, spec_from_file_location
+package, *sys.path[:] = sys.argv[1:-3]
+spec = spec_from_file_location("torchrl_bmrl", package + "/__init__.py")
+sys.modules["torchrl_bmrl"] = module_from_spec(spec)
+spec.loader.exec_module(sys.modules["torchrl_bmrl"])
+from {__name__} import _render
+_render(*sys.argv[-3:])
+"""
+"""Program of the subprocess: this very package, and others from the paths that are given."""
 _TARGET = (-0.1, 0.0, 0.98)  # between table and arm [m]
 _DISTANCE, _AZIMUTH, _ELEVATION = 1.4, 180.0, -20.0  # in front of the table [m, deg, deg]
 
@@ -143,13 +155,14 @@ def _run(library: str, arguments: list[str], report: Callable[[int], Any]) -> st
     environment = {**os.environ, "MUJOCO_GL": library}
     # PyOpenGL must load the same library, or it finds no context.
     environment |= {"PYOPENGL_PLATFORM": library} if library in ("egl", "osmesa") else {}
-    # The subprocess must import this package, whatever its working directory.
-    paths = [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")]
-    environment["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
+    # The subprocess imports what this process would, and nothing from the current folder, which
+    # may hold a stranger's files; in a clone, this package itself lies there.
+    here, package = Path.cwd(), str(Path(__file__).parents[1])
+    paths = [path for path in sys.path if path and Path(path).resolve() != here]
     with (
         tempfile.TemporaryFile("w+") as errors,
         subprocess.Popen(
-            [sys.executable, "-m", __name__, *arguments],
+            [sys.executable, "-I", "-c", _START, package, *paths, str(os.getpid()), *arguments],
             env=environment,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -174,8 +187,9 @@ def _run(library: str, arguments: list[str], report: Callable[[int], Any]) -> st
     return lines[-1] if lines else f"the process ended with code {process.returncode}"
 
 
-def _render(task: str, result: str) -> None:
+def _render(parent: str, task: str, result: str) -> None:
     """Main function of the subprocess: renders all scenes, one line of output for each picture."""
+    end_with_parent(int(parent))
     with needs("robosuite"):
         import mujoco
 
@@ -191,6 +205,7 @@ def _render(task: str, result: str) -> None:
         for number, text in enumerate(scenes["models"]):
             # Compiling takes seconds, and scenes differ only in the marker's position.
             root = ET.fromstring(str(text))
+            check_assets(root)
             marker = root.find(f".//site[@name='{GOAL_MARKER}']")
             place = None if marker is None else np.array(marker.get("pos", "0 0 0").split(), float)
             if marker is not None:
@@ -226,32 +241,11 @@ def _pictures(
     return pictures
 
 
-def _compiled(mujoco: Any, text: str) -> Any:
-    """A model, compiled in a process of its own: MuJoCo keeps four times the model's memory."""
-    if not hasattr(os, "fork"):
-        return mujoco.MjModel.from_xml_string(text)
-    with tempfile.TemporaryDirectory() as folder:
-        path = str(Path(folder, "model.mjb"))
-        if (process := os.fork()) == 0:
-            try:
-                mujoco.mj_saveModel(mujoco.MjModel.from_xml_string(text), path)
-            finally:
-                os._exit(0)
-        os.waitpid(process, 0)
-        if Path(path).exists():
-            return mujoco.MjModel.from_binary_path(path)
-    return mujoco.MjModel.from_xml_string(text)  # raises its error here
-
-
 def _make_renderer(mujoco: Any, text: str, size: int) -> tuple[Any, Any, Any]:
-    model = _compiled(mujoco, text)
+    model = compile_scene(text)
     model.vis.quality.offsamples = 0  # no antialiasing: a third of the time
     model.vis.quality.shadowsize = 0  # 64 MB for shadows that are not drawn
     for index in range(model.nsite):
         if model.site(index).name != GOAL_MARKER:
             model.site_rgba[index, 3] = 0.0
     return model, mujoco.MjData(model), mujoco.Renderer(model, size, size)
-
-
-if __name__ == "__main__":
-    _render(*sys.argv[1:])
