@@ -82,3 +82,35 @@ def test_a_study_leads_to_no_file_outside_its_run(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace("curve.png", "../../secret.png"))
     with pytest.raises(DataError):
         read_studies(run)
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "device", "text"])
+def test_a_picture_is_a_png_in_the_run_and_no_link(tmp_path: Path, kind: str) -> None:
+    run = tmp_path / "run"
+    write_study(run, "noise", SECTION, {"curve": PICTURE})
+    picture = run / "figures" / "curve.png"
+    (tmp_path / "outside").mkdir()
+    picture.replace(tmp_path / "outside" / "curve.png")
+    if kind == "file":
+        picture.symlink_to(tmp_path / "outside" / "curve.png")
+    elif kind == "folder":
+        picture.parent.rmdir()
+        picture.parent.symlink_to(tmp_path / "outside")
+    elif kind == "device":
+        picture.symlink_to("/dev/null")
+    else:
+        picture.write_text("no picture")
+    with pytest.raises(
+        DataError, match=r"curve\.png: (a link or a device|not a PNG picture); valid"
+    ):
+        read_studies(run)
+
+
+def test_a_study_s_explorer_is_no_link(tmp_path: Path) -> None:
+    write_study(tmp_path, "a", SECTION, {"curve": PICTURE})
+    path = tmp_path / "studies" / "a.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "explorer": True}))
+    (tmp_path / "secret.json").write_text("{}")
+    (tmp_path / "figures" / "a.json").symlink_to(tmp_path / "secret.json")
+    with pytest.raises(DataError, match=r"figures/a\.json: a link"):
+        read_studies(tmp_path)

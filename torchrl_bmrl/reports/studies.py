@@ -14,6 +14,9 @@ from torchrl_bmrl.reports.explorer import StoredExplorer
 from torchrl_bmrl.reports.page import Picture, Section
 from torchrl_bmrl.reports.tables import Table
 
+_PNG = b"\x89PNG"
+"""First bytes of every PNG."""
+
 
 def write_study(
     run_dir: str | os.PathLike[str], name: str, section: Section, figures: Mapping[str, Picture]
@@ -75,7 +78,7 @@ def _read(path: Path) -> Section:
         pictures = [
             Picture(
                 # Only the file name is used, so that a foreign file cannot point out of the folder.
-                png=(path.parents[1] / "figures" / Path(picture["file"]).name).read_bytes(),
+                png=_read_png(_figure(path, Path(picture["file"]).name)),
                 alt=picture["alt"],
                 caption=picture["caption"],
             )
@@ -83,7 +86,7 @@ def _read(path: Path) -> Section:
         ]
         explorer = None
         if content.get("explorer"):  # studies of earlier versions say nothing of it
-            figure = path.parents[1] / "figures" / path.name
+            figure = _figure(path, path.name)
             explorer = StoredExplorer(**json.loads(figure.read_text(encoding="utf-8")))
         return Section(
             heading=content["heading"],
@@ -94,3 +97,20 @@ def _read(path: Path) -> Section:
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(path, None, f"not the results of a study ({error}); remove it") from error
+
+
+def _figure(study: Path, name: str) -> Path:
+    """A file among the figures of a run folder: the page would show what a link leads to."""
+    file = study.parents[1] / "figures" / name
+    own = study.parents[1].resolve() / "figures" / name
+    if file.resolve() != own or not file.is_file():
+        kind = "a link or a device" if os.path.lexists(file) else "missing"
+        raise DataError(file, None, f"{kind}; valid: a file in the run folder")
+    return file
+
+
+def _read_png(file: Path) -> bytes:
+    content = file.read_bytes()
+    if not content.startswith(_PNG):
+        raise DataError(file, None, "not a PNG picture; valid: one, as the study wrote it")
+    return content
