@@ -77,6 +77,27 @@ def test_a_dump_that_is_not_there_is_named(tmp_path: Path) -> None:
         single().loads(tmp_path / "nowhere")
 
 
+@every_buffer
+def test_a_dump_that_was_cut_short_is_refused_by_name_and_size_and_changes_nothing(
+    make: Make, tmp_path: Path
+) -> None:
+    make().dumps(tmp_path)
+    file = max(tmp_path.rglob("*.memmap"), key=lambda file: file.stat().st_size)
+    content = file.read_bytes()
+    loaded = make()
+    before = loaded[:].clone()
+    for size in (len(content) - 1, 0, len(content) + 1):
+        file.write_bytes((content + b"x")[:size])
+        with pytest.raises(DataError, match=f"{size} bytes; valid: {len(content)}, ") as caught:
+            loaded.loads(tmp_path)
+        assert caught.value.path == file
+        assert file.stat().st_size == size
+    file.unlink()
+    with pytest.raises(DataError, match=f"0 bytes; valid: {len(content)}, "):
+        loaded.loads(tmp_path)
+    assert (loaded[:] == before).all()
+
+
 class Executed:
     """Creates a file when its pickle is read."""
 

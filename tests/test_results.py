@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.evaluation.results import (
     RESULT_FIELDS,
     ResultRow,
@@ -118,6 +118,30 @@ def test_a_bad_value_is_named_with_file_line_and_column(
         read_results(path)
     for part in (str(path), "line 3", column, repr(value), valid):
         assert part in str(caught.value)
+
+
+def test_an_episode_is_not_counted_twice(tmp_path: Path) -> None:
+    path = written(
+        tmp_path / "results.csv", LINE, {**LINE, "episode": "8"}, {**LINE, "return": "9"}
+    )
+    with pytest.raises(DataError) as caught:
+        read_results(path)
+    for part in (str(path), "line 4", "episode", "of line 2"):
+        assert part in str(caught.value)
+
+
+@pytest.mark.parametrize("number", [1.5e308, 1e200, float("inf"), float("nan")])
+def test_returns_without_a_finite_mean_and_deviation_are_not_averaged(number: float) -> None:
+    rows = [replace(ROW, episode=i, episode_return=number * (i > 0)) for i in range(3)]
+    with pytest.raises(BMRLError, match=r"policy .* on .*: .*mean.*valid: finite"):
+        summarise(rows)
+
+
+def test_a_byte_order_mark_hides_no_column(tmp_path: Path) -> None:
+    path = written(tmp_path / "results.csv", LINE)
+    rows = read_results(path)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert read_results(path) == rows
 
 
 def test_a_source_is_refused_where_the_policy_has_none(tmp_path: Path) -> None:

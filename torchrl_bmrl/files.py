@@ -264,7 +264,8 @@ def read_rows(
     if not path.is_file():
         raise DataError(path, None, f"no such file; expected a CSV with {', '.join(columns)}")
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        # "utf-8-sig" skips the byte order mark that spreadsheets write, which would hide a column.
+        with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
             for column in columns:
                 if column not in (reader.fieldnames or ()):

@@ -6,6 +6,7 @@ import ctypes
 import json
 import mmap
 from collections.abc import Sequence
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -32,13 +33,31 @@ def read_memmap(path: Path) -> TensorDict:
         path: folder that tensordict wrote.
 
     Raises:
-        DataError: if it contains a pickle, or tensordict did not write it.
+        DataError: if it contains a pickle, tensordict did not write it, or a file was cut.
     """
     try:
+        _check_sizes(path)
         # These maps are shared with the files; they are only used for the files' names.
         return TensorDict.load_memmap(path, allow_pickle=False).apply(_private)
+    except DataError:
+        raise
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(path, None, f"not a folder of memory-mapped tensors ({error})") from error
+
+
+def _check_sizes(path: Path) -> None:
+    """Compares files with their descriptions; tensordict lets a short one grow, with zeros."""
+    for description in sorted(Path(path).rglob("meta.json")):
+        for key, told in json.loads(description.read_bytes()).items():
+            if not isinstance(told, dict) or "shape" not in told:
+                continue  # not a tensor
+            file = description.with_name(f"{key}.memmap")
+            dtype = getattr(torch, told["dtype"].removeprefix("torch."))
+            valid = prod(told["shape"]) * dtype.itemsize
+            found = file.stat().st_size if file.is_file() else 0
+            if found != valid:
+                message = f"{found} bytes; valid: {valid}, {told['dtype']} {tuple(told['shape'])}"
+                raise DataError(file, None, message)
 
 
 def _private(leaf: Tensor) -> Tensor:
@@ -196,8 +215,12 @@ class DatasetBuffer(TensorDictReplayBuffer):
         """
         path = Path(path).absolute()
         try:
-            self.sampler.loads(path / "sampler")  # before the storage is overwritten
-            read_memmap(path / "storage")  # refuses pickles, which TorchRL's reader would load
+            # Nothing changes unless all can be read. TorchRL's reader would also load pickles.
+            state = json.loads((path / "sampler" / "sampler_metadata.json").read_text())
+            read_memmap(path / "storage")
+            if (path / "rng_state").exists():
+                read_memmap(path / "rng_state")
+            self.sampler.load_state_dict(state)
             with self._futures_lock:
                 self._clear_prefetch_queue_locked()  # its samples are of the data before
                 self.storage.loads(path / "storage")
@@ -205,7 +228,7 @@ class DatasetBuffer(TensorDictReplayBuffer):
                     self._rng.set_state(read_memmap(path / "rng_state")["rng_state"])
         except BMRLError:
             raise
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
+        except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
             raise DataError(path, None, f"not a dump of these data ({error})") from error
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.evaluation.statistics import bootstrap_interval
 from torchrl_bmrl.files import finite, flag, parse_row, read_rows, whole, write_atomic
 
@@ -66,6 +66,8 @@ RESULT_COLUMNS: Mapping[str, Callable[[str], Any]] = {
 """Columns of ``results.csv`` and the parser of each."""
 RESULT_FIELDS: tuple[str, ...] = tuple(RESULT_COLUMNS)
 """Names of the columns of ``results.csv``, in their order."""
+_EPISODE = ("task", "policy", "latent_source", "seed", "episode")
+"""Columns that tell episodes apart."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +151,8 @@ def read_results(path: str | os.PathLike[str]) -> list[ResultRow]:
         The rows in the file's order.
 
     Raises:
-        DataError: if the file or a column is missing, or a value is not valid.
+        DataError: if the file or a column is missing, a value is not valid, or an episode has two
+            lines.
 
     Example:
         >>> import tempfile
@@ -161,8 +164,15 @@ def read_results(path: str | os.PathLike[str]) -> list[ResultRow]:
         >>> read_results(path) == [row]
         True
     """
-    rows = read_rows(path, RESULT_COLUMNS)
-    return [result_row(row, Path(path), line) for line, row in enumerate(rows, start=2)]
+    lines: dict[tuple[Any, ...], int] = {}
+    rows = []
+    for line, values in enumerate(read_rows(path, RESULT_COLUMNS), start=2):
+        rows.append(result_row(values, Path(path), line))
+        episode = tuple(values[name] for name in _EPISODE)
+        if (first := lines.setdefault(episode, line)) != line:
+            message = f"value in line {line} is {values['episode']}, the episode of line {first}"
+            raise DataError(Path(path), "episode", f"{message}; expected each episode once")
+    return rows
 
 
 def result_row(values: Mapping[str, Any], path: Path, line: int) -> ResultRow:
@@ -233,6 +243,9 @@ def summarise(rows: Iterable[ResultRow], tasks: Iterable[str] = ()) -> list[Summ
     Returns:
         Summaries in the order of the tasks, then of :func:`policy_order`, then sources by name.
 
+    Raises:
+        BMRLError: for returns without a finite mean and standard deviation.
+
     Example:
         >>> rows = [
         ...     ResultRow(
@@ -270,6 +283,13 @@ def _summary(key: tuple[str, str, str], rows: list[ResultRow]) -> Summary:
     seeds = [row.seed for row in rows]
     returns = np.array([row.episode_return for row in rows], dtype=np.float64)
     outcomes = [row.success for row in rows]
+    with np.errstate(over="ignore", invalid="ignore"):
+        mean, deviation = returns.mean(), returns.std(ddof=1) if len(rows) > 1 else 0.0
+    if not np.isfinite([mean, deviation]).all():
+        raise BMRLError(
+            f"returns of policy {key[1]} on {key[0]}: up to {np.abs(returns).max()}, with mean "
+            f"{mean} and standard deviation {deviation}; valid: finite ones"
+        )
     successes = None if None in outcomes else np.array(outcomes, dtype=np.float64)
     return Summary(
         task=key[0],
@@ -277,8 +297,8 @@ def _summary(key: tuple[str, str, str], rows: list[ResultRow]) -> Summary:
         latent_source=key[2],
         episodes=len(rows),
         seeds=len(set(seeds)),
-        mean_return=float(returns.mean()),
-        std_return=float(returns.std(ddof=1)) if len(rows) > 1 else 0.0,
+        mean_return=float(mean),
+        std_return=float(deviation),
         return_interval=bootstrap_interval(returns, strata=seeds),
         success_rate=None if successes is None else float(successes.mean()),
         success_interval=None if successes is None else bootstrap_interval(successes, strata=seeds),
