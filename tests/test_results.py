@@ -137,6 +137,13 @@ def test_returns_without_a_finite_mean_and_deviation_are_not_averaged(number: fl
         summarise(rows)
 
 
+def test_a_column_that_adds_up_to_infinity_is_refused_by_name(tmp_path: Path) -> None:
+    lines = [{**LINE, "episode": str(i), "return": "1.5e308"} for i in range(2)]
+    read_results(written(tmp_path / "one.csv", lines[0]))
+    with pytest.raises(DataError, match=r"two\.csv: return: its values add up to infinity"):
+        read_results(written(tmp_path / "two.csv", *lines))
+
+
 def test_a_byte_order_mark_hides_no_column(tmp_path: Path) -> None:
     path = written(tmp_path / "results.csv", LINE)
     rows = read_results(path)

@@ -251,7 +251,7 @@ def read_rows(
 
     Raises:
         DataError: naming file, line, column and value, if the file or a column is missing, or a
-            value is not valid.
+            value is not valid; naming file and column, if numbers have no finite sum.
 
     Example:
         >>> import tempfile
@@ -271,9 +271,16 @@ def read_rows(
                 if column not in (reader.fieldnames or ()):
                     message = f"column is missing; expected the columns {', '.join(columns)}"
                     raise DataError(path, column, message)
-            return [parse_row(record, columns, path, reader.line_num) for record in reader]
+            rows = [parse_row(record, columns, path, reader.line_num) for record in reader]
     except (csv.Error, UnicodeDecodeError) as error:
         raise DataError(path, None, f"not a CSV file ({error})") from error
+    for column in columns:
+        try:
+            math.fsum(x for row in rows if isinstance(x := row[column], float) and math.isfinite(x))
+        except OverflowError:
+            message = "its values add up to infinity; expected a finite sum"
+            raise DataError(path, column, message) from None
+    return rows
 
 
 def parse_row(
