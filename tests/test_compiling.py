@@ -51,7 +51,13 @@ def large(_: str) -> None:
     np.ones(2**28, np.uint8).sum()
 
 
-@pytest.mark.parametrize(("compiles", "says"), [(endless, "takes more than"), (large, "allocate")])
+LINUX = pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits memory and has prctl")
+
+
+@pytest.mark.parametrize(
+    ("compiles", "says"),
+    [(endless, "takes more than"), pytest.param(large, "allocate", marks=LINUX)],
+)
 def test_a_compilation_ends_at_its_limits(
     monkeypatch: pytest.MonkeyPatch, compiles: Any, says: str
 ) -> None:
@@ -74,7 +80,7 @@ compile_scene("<mujoco/>")
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="needs prctl")
+@LINUX
 def test_a_compilation_ends_with_the_process_that_started_it() -> None:
     with subprocess.Popen([sys.executable, "-c", WAITS], stdout=subprocess.PIPE) as parent:
         assert parent.stdout is not None

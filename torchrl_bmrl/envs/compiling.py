@@ -115,23 +115,25 @@ def _end_with_parent() -> Any:
     def end_with(parent: int) -> None:
         if control is not None:
             control(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
-        if os.getppid() != parent:
-            os._exit(1)
+            if os.getppid() != parent:
+                os._exit(1)
 
     return end_with
 
 
 def _limit(seconds: int, memory: int) -> None:
     """Limits this process: the time and memory that it takes from now on, and its files."""
-    pages = Path("/proc/self/statm").read_text().split() if sys.platform == "linux" else [0] * 7
-    space, data = (int(pages[i]) * resource.getpagesize() for i in (0, 5))
-    for kind, most in (
-        (resource.RLIMIT_DATA, data + memory),
-        (resource.RLIMIT_AS, space + 4 * memory),  # threads reserve more than they use
-        (resource.RLIMIT_CPU, seconds),
-        (resource.RLIMIT_FSIZE, memory),
-        (resource.RLIMIT_CORE, 0),
-    ):
+    limits = {
+        resource.RLIMIT_CPU: seconds,
+        resource.RLIMIT_FSIZE: memory,
+        resource.RLIMIT_CORE: 0,
+    }
+    if sys.platform == "linux":  # elsewhere it is unknown what this process has already
+        pages = Path("/proc/self/statm").read_text().split()
+        space, data = (int(pages[i]) * resource.getpagesize() for i in (0, 5))
+        limits[resource.RLIMIT_DATA] = data + memory
+        limits[resource.RLIMIT_AS] = space + 4 * memory  # threads reserve more than they use
+    for kind, most in limits.items():
         hard = resource.getrlimit(kind)[1]
         most = most if hard == resource.RLIM_INFINITY else min(most, hard)
         resource.setrlimit(kind, (most, most))
