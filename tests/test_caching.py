@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -104,17 +104,105 @@ def test_a_changed_function_of_robosuite_is_compiled_anew_and_followed(tmp_path:
         assert (misses, joints) == (0, reached[name]), name
 
 
-def test_another_version_of_a_package_is_another_cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    before = caching.fingerprint(control_period)
-    monkeypatch.setattr(caching, "_versions", caching._versions.__wrapped__)
-    assert caching.fingerprint(control_period) == before
-    for package in ("robosuite", "mujoco", "numba", "numpy"):
-        with monkeypatch.context() as patch:
-            patch.setattr(
-                caching, "version", lambda name, package=package: "0" if name == package else "1"
-            )
-            before, now = caching.fingerprint(control_period), before
-            assert before != now
+def test_another_version_or_place_of_a_package_is_another_cache(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(caching, "_environment", caching._environment.__wrapped__)
+    seen = [caching.fingerprint(control_period)]
+    assert caching.fingerprint(control_period) == seen[0]
+    for package in ("robosuite", "mujoco", "numba", "llvmlite", "numpy", "scipy"):
+        for name, other in {
+            "version": lambda name, package=package: "0" if name == package else "1",
+            "find_spec": lambda name, package=package: SimpleNamespace(origin=name == package),
+        }.items():
+            with monkeypatch.context() as patch:
+                patch.setattr(caching, name, other)
+                seen.append(caching.fingerprint(control_period))
+    monkeypatch.setattr(sys, "prefix", "/another/environment")
+    seen.append(caching.fingerprint(control_period))
+    assert len(set(seen)) == len(seen)
+
+
+def test_another_file_with_the_same_function_is_another_cache(tmp_path: Path) -> None:
+    """The order of a named tuple's fields is compiled in, and no function contains it."""
+    found = set()
+    for fields in ("a: float; b: float", "b: float; a: float"):
+        file = tmp_path / f"{len(found)}.py"
+        file.write_text(
+            f"from typing import NamedTuple\nclass P(NamedTuple): {fields}\ndef f(p): return p.a\n"
+        )
+        module: dict[str, Any] = {"__name__": "places"}
+        exec(compile(file.read_text(), file, "exec"), module)
+        found.add(caching.fingerprint(module["f"]))
+    assert len(found) == 2
+
+
+def doubled(x: float) -> float:
+    return 2 * x
+
+
+def compiled_anew(x: float = 1.0) -> int:
+    """How often one call of :func:`doubled` compiles, in a process that starts."""
+    made = caching.cached_njit(doubled)
+    assert made(x) == 2 * x
+    return sum(made.stats.cache_misses.values())
+
+
+@pytest.mark.parametrize("kind", ["*.nbi", "*.nbc"])
+@pytest.mark.parametrize("damage", ["cut", "changed", "empty", "a folder"])
+def test_damaged_compiled_code_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, damage: str
+) -> None:
+    monkeypatch.setattr(caching.config, "CACHE_DIR", str(tmp_path))
+    assert compiled_anew() == 1
+    assert compiled_anew() == 0
+    (file,) = tmp_path.rglob(kind)
+    content = file.read_bytes()
+    if damage == "a folder":
+        file.unlink()
+        file.mkdir()
+    else:
+        middle = len(content) // 2
+        changed = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+        file.write_bytes({"cut": content[:-40], "changed": changed, "empty": b""}[damage])
+    assert compiled_anew() == 1
+    if damage != "a folder":  # which nobody but its owner removes
+        assert compiled_anew() == 0
+
+
+def test_processes_that_begin_at_once_do_not_take_each_others_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(caching.config, "CACHE_DIR", str(tmp_path))
+    file = caching.cached_njit(doubled)._cache._cache_file
+    assert file._data_name(1) != file._data_name(1)
+
+
+def test_a_user_without_a_home_has_a_cache_for_the_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(caching.config, "CACHE_DIR", "")
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(caching.tempfile, "tempdir", str(tmp_path))
+
+    def nobody() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", nobody)
+    folder = caching.numba_cache_dir()
+    assert folder.parent == tmp_path
+    assert folder == caching.numba_cache_dir()
+    assert compiled_anew() == 1
+    assert compiled_anew() == 0
+
+
+def test_a_home_that_cannot_be_written_is_replaced_by_a_cache_for_the_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "home").write_text("a file")
+    monkeypatch.setattr(caching.config, "CACHE_DIR", str(tmp_path / "home" / "cache"))
+    monkeypatch.setattr(caching.tempfile, "tempdir", str(tmp_path))
+    assert caching.numba_cache_dir().name.startswith("torchrl_bmrl-")
 
 
 OFFSET = 1.0

@@ -2,35 +2,63 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
+import io
+import logging
 import os
+import shutil
+import sys
+import tempfile
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from numbers import Number
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 from torchrl_bmrl.extras import needs
+from torchrl_bmrl.files import write_atomic
 
 with needs("robosuite"):
     import numba
     import numpy as np
-    from numba.core import config
+    from numba.core import config, dispatcher
+    from numba.core.caching import FunctionCache, IndexDataCacheFile
 
-PACKAGES = ("robosuite", "mujoco", "numba", "numpy")
-"""A new version of one of these packages invalidates the cache."""
+log = logging.getLogger(__name__)
+
+PACKAGES = ("robosuite", "mujoco", "numba", "llvmlite", "numpy", "scipy")
+"""Another version or another place of one of these packages is another cache."""
+_CHECKSUM = hashlib.sha256().digest_size
 
 
 def numba_cache_dir() -> Path:
     """The user's directory of compiled code: ``$XDG_CACHE_HOME/torchrl_bmrl/numba``.
 
-    numba's own setting ``NUMBA_CACHE_DIR`` takes precedence.
+    numba's own setting ``NUMBA_CACHE_DIR`` takes precedence. Without a directory that can be
+    written, such as for a user without a home, it is a temporary one of this process.
     """
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(config.CACHE_DIR or Path(home) / "torchrl_bmrl" / "numba")
+    try:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(config.CACHE_DIR or Path(home) / "torchrl_bmrl" / "numba")
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+        return folder
+    except (OSError, RuntimeError) as error:
+        return _temporary_dir(str(error))
+
+
+@cache
+def _temporary_dir(reason: str) -> Path:
+    folder = tempfile.mkdtemp(prefix="torchrl_bmrl-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    log.debug("compiled code is kept for this process only (%s)", reason)
+    return Path(folder)
 
 
 @contextmanager
@@ -46,10 +74,62 @@ def user_numba_cache(*functions: Any) -> Iterator[None]:
     """
     before = config.CACHE_DIR
     config.CACHE_DIR = str(numba_cache_dir() / fingerprint(*functions))
+    dispatcher.FunctionCache = _CheckedCache  # type: ignore[attr-defined]
     try:
         yield
     finally:
         config.CACHE_DIR = before
+        dispatcher.FunctionCache = FunctionCache  # type: ignore[attr-defined]
+
+
+class _CheckedCache(FunctionCache):
+    """numba's cache of one function; code that is damaged or cannot be written is no error."""
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)
+        kept: Any = self._cache_file  # type: ignore[has-type]
+        self._cache_file = _CheckedFile(
+            kept._cache_path, self._impl.filename_base, kept._source_stamp
+        )
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            log.warning("compiled code cannot be kept in %s (%s)", self.cache_path, error)
+
+
+class _CheckedFile(IndexDataCacheFile):
+    """numba's files of one function, with checksums: a damaged file counts as missing.
+
+    numba reads them as pickles, and runs the code in them.
+    """
+
+    @contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[io.BytesIO]:
+        content = io.BytesIO()
+        yield content
+        # numba ignores what comes after its own content.
+        write_atomic(filepath, content.getvalue() + hashlib.sha256(content.getvalue()).digest())
+
+    def _load_index(self) -> dict[Any, str]:
+        return super()._load_index() if _is_whole(self._index_path) else {}
+
+    def _load_data(self, name: str) -> Any:
+        return super()._load_data(name) if _is_whole(self._data_path(name)) else None
+
+    def _data_name(self, number: int) -> str:
+        # numba counts. Of two processes that begin at once, one would take the other's code.
+        return super()._data_name(uuid.uuid4().int)
+
+
+def _is_whole(path: str) -> bool:
+    try:
+        content = Path(path).read_bytes()
+    except OSError:
+        return False
+    text, checksum = content[:-_CHECKSUM], content[-_CHECKSUM:]
+    return bool(text) and hashlib.sha256(text).digest() == checksum
 
 
 def cached_njit(function: Callable[..., Any]) -> Any:
@@ -61,10 +141,11 @@ def cached_njit(function: Callable[..., Any]) -> Any:
 def fingerprint(*functions: Any) -> str:
     """Hash of everything that numba compiles for some functions, as 16 hexadecimal digits.
 
-    It covers the versions of :data:`PACKAGES`; each function's code, defaults and closure; the
-    functions that they call, recursively; and global constants, which numba compiles in.
+    It covers Python; the versions and places of :data:`PACKAGES`; each function's code, file,
+    defaults and closure; the functions that they call, recursively; and global constants, which
+    numba compiles in.
     """
-    digest = hashlib.sha256(_versions().encode())
+    digest = hashlib.sha256(_environment().encode())
     todo, seen = list(functions), set()
     while todo:
         value = todo.pop()
@@ -75,6 +156,7 @@ def fingerprint(*functions: Any) -> str:
             seen.add(value)
             codes = _codes(value.__code__)
             names = sorted({name for code in codes for name in code.co_names})
+            digest.update(_source(value.__code__.co_filename))
             for code in codes:
                 digest.update(code.co_code)
             todo += [x for code in codes for x in code.co_consts if not isinstance(x, CodeType)]
@@ -101,14 +183,24 @@ def _is_compiled_in(value: Any) -> bool:
 
 
 @cache
-def _versions() -> str:
-    versions = {}
+def _source(path: str) -> bytes:
+    """Hash of a file, which also defines the named tuples whose places numba compiles in."""
+    try:
+        return hashlib.sha256(Path(path).read_bytes()).digest()
+    except OSError:  # typed in, or in an archive
+        return b""
+
+
+@cache
+def _environment() -> str:
+    found: dict[str, Any] = {"python": (sys.version, sys.prefix)}
     for package in PACKAGES:
+        spec = find_spec(package)
         try:
-            versions[package] = version(package)
+            found[package] = version(package), spec and spec.origin
         except PackageNotFoundError:  # a copy on the path
-            versions[package] = "unknown"
-    return repr(versions)
+            found[package] = "unknown", spec and spec.origin
+    return repr(found)
 
 
 def _codes(code: CodeType) -> list[CodeType]:
