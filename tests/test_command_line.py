@@ -21,7 +21,7 @@ pytest.importorskip("tqdm")
 from small_runs import RECIPES, command_line, configured, make_run, recipe, settings_of
 
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.evaluation import write_results
+from torchrl_bmrl.evaluation import ResultRow, write_results
 from torchrl_bmrl.pipeline import Run, Settings
 
 
@@ -165,7 +165,15 @@ def test_rows_that_are_read_back_are_reported_as_the_steps_that_they_took(
 
     run = make_run(tmp_path, "tasks={lift:{task:lift,horizon:7}}", "evaluate.episodes=3")
     (tmp_path / "evaluation").mkdir()
-    write_results(tmp_path / "evaluation" / "lift-bcq.csv", [])
+    row = ResultRow(
+        task="lift",
+        policy="bcq",
+        seed=run.settings.seed,
+        episode=0,
+        episode_return=1.0,
+        success=True,
+    )
+    write_results(tmp_path / "evaluation" / "lift-bcq.csv", [row])
     reported: list[int] = []
     evaluate_once(run, "lift", "bcq", lambda _: [], report=reported.append)
     assert reported == [7 * 3]

@@ -178,32 +178,23 @@ def digest_of(*paths: Path) -> str:
     return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()
 
 
-def check_no_linked_folders(folder: str | os.PathLike[str]) -> None:
-    """Checks that no folder inside of a folder is a link: files elsewhere would change through it.
-
-    Files may be links, because they are replaced and never modified. The folders ``wandb`` are left
-    out: Weights & Biases links its newest run.
+def parse_json(text: str | bytes) -> Any:
+    """Parses JSON, or raises ``ValueError``, also if it is nested too deeply.
 
     Args:
-        folder: The folder, which may be a link itself, or missing.
-
-    Raises:
-        DataError: naming the first link.
+        text: the text. It is refused if a text in it is not Unicode, which no file could contain.
 
     Example:
-        >>> import tempfile
-        >>> folder = Path(tempfile.mkdtemp())
-        >>> (folder / "bcq").symlink_to(tempfile.mkdtemp())
-        >>> check_no_linked_folders(folder)
-        Traceback (most recent call last):
-        ...
-        torchrl_bmrl.errors.DataError: .../bcq: is a link to /...; valid: a folder, ...
+        >>> parse_json('{"fps": 20}')
+        {'fps': 20}
     """
-    for path in sorted(Path(folder).rglob("*")):
-        inside = path.relative_to(folder).parts[:-1]
-        if path.is_symlink() and path.is_dir() and "wandb" not in inside:
-            message = f"is a link to {path.resolve()}; valid: a folder, as files would change there"
-            raise DataError(path, None, message)
+    try:
+        content = json.loads(text)
+        if "\\u" in str(text):  # \ud800 alone is half a character
+            json.dumps(content, ensure_ascii=False).encode()
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+    return content
 
 
 def read_json(path: str | os.PathLike[str], what: str) -> Any:
@@ -217,8 +208,8 @@ def read_json(path: str | os.PathLike[str], what: str) -> Any:
         DataError: if it is missing, damaged or nested too deeply.
     """
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        return parse_json(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
         raise DataError(Path(path), None, f"not {what} ({error})") from error
 
 
@@ -237,7 +228,9 @@ def write_rows(path: str | os.PathLike[str], rows: Sequence[Mapping[str, Any]]) 
 
 
 def read_rows(
-    path: str | os.PathLike[str], columns: Mapping[str, Callable[[str], Any]]
+    path: str | os.PathLike[str],
+    columns: Mapping[str, Callable[[str], Any]],
+    expected: Sequence[Mapping[str, Any]] | None = None,
 ) -> list[dict[str, Any]]:
     """Reads some columns of a CSV file.
 
@@ -245,13 +238,15 @@ def read_rows(
         path: The file.
         columns: A parser for each column's texts. It raises ``ValueError`` with a description of
             valid texts, as :func:`whole`, :func:`finite` and :func:`one_of` do.
+        expected: What is known of each line, by column; ``None`` for any lines.
 
     Returns:
         One dictionary per line.
 
     Raises:
         DataError: naming file, line, column and value, if the file or a column is missing, or a
-            value is not valid; naming file and column, if numbers have no finite sum.
+            value is not valid or not expected; naming file and column, if numbers have no finite
+            sum.
 
     Example:
         >>> import tempfile
@@ -280,7 +275,34 @@ def read_rows(
         except OverflowError:
             message = "its values add up to infinity; expected a finite sum"
             raise DataError(path, column, message) from None
+    if expected is not None:
+        check_rows(path, rows, expected)
     return rows
+
+
+def check_rows(
+    path: str | os.PathLike[str],
+    rows: Sequence[Mapping[str, Any]],
+    expected: Sequence[Mapping[str, Any]],
+) -> None:
+    """Refuses a file's rows that are not those that its run or study writes.
+
+    Args:
+        path: The file, for the message.
+        rows: As :func:`read_rows` returns them.
+        expected: What is known of each, by column.
+
+    Raises:
+        DataError: naming the first that differs.
+    """
+    for number, (row, known) in enumerate(zip(rows, expected, strict=False), start=1):
+        for column, value in known.items():
+            if row[column] != value:
+                message = f"{row[column]!r} in row {number}; valid: {value!r}; remove the file"
+                raise DataError(Path(path), column, message)
+    if len(rows) != len(expected):
+        message = f"{len(rows)} rows; valid: {len(expected)}; remove the file"
+        raise DataError(Path(path), None, message)
 
 
 def parse_row(
@@ -314,11 +336,13 @@ def parse_row(
 
 
 def whole(text: str) -> int:
-    """Parses an integer, or raises ``ValueError``."""
+    """Parses an integer of at most 64 bits, or raises ``ValueError``."""
     try:
-        return int(text)
+        if -(2**63) <= (value := int(text)) < 2**63:
+            return value
     except ValueError:
-        raise ValueError("a whole number") from None
+        pass
+    raise ValueError("a whole number")
 
 
 def number(text: str) -> float:

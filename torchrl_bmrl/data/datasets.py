@@ -33,7 +33,7 @@ from torchrl_bmrl.data.source_files import CHANGED
 from torchrl_bmrl.data.sources import find_format, open_source
 from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.extras import needs
-from torchrl_bmrl.files import new_folder
+from torchrl_bmrl.files import new_folder, parse_json
 from torchrl_bmrl.functional import mean_and_scale
 
 with needs("data"):
@@ -235,8 +235,11 @@ def _read_metadata(path: Path) -> str | None:
         text = (path / "metadata.json").read_bytes()
         if (path / "metadata.crc32").read_text() != f"{zlib.crc32(text):08x}":
             return None
-        whole = all(_crc32(path / name) == crc for name, crc in json.loads(text)["crc32"].items())
-    except (OSError, ValueError, KeyError, TypeError):
+        metadata = parse_json(text.decode())
+        lists = all(isinstance(metadata[key], list) for key in ("episodes", "warnings", "oddities"))
+        sums = metadata["crc32"].items()
+        whole = lists and all(_crc32(path / name) == crc for name, crc in sums)
+    except (AttributeError, OSError, ValueError, KeyError, TypeError):
         return None
     return text.decode() if whole else None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import reprlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from torchrl_bmrl.data.convert import Stream
 from torchrl_bmrl.data.datasets import RobomimicExperienceReplay
+from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import open_episodes
 from torchrl_bmrl.data.robomimic_file import CONTEXT_MASK, read_metadata
 from torchrl_bmrl.data.source_files import CHANGED
@@ -23,7 +25,7 @@ from torchrl_bmrl.envs.transforms import (
     observation_parts,
     transform_data,
 )
-from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.files import digest_of, read_json, write_atomic
 from torchrl_bmrl.tasks import Task
 
@@ -110,6 +112,33 @@ def read_demonstrations(
     return data.set("task", torch.full((len(data),), index))
 
 
+def phase_names(path: Path, demo: str, episode: Episode) -> tuple[str, ...]:
+    """The names of an episode's phases; none for one without phases.
+
+    Args:
+        path: of its file, for messages.
+        demo: its key, for messages.
+        episode: with all attributes, and the extra ``phases`` if it has one.
+
+    Raises:
+        DataError: if the names are not a list, or an index has no name.
+    """
+    phases, names = episode.extras.get("phases"), episode.attributes.get("phase_names", ())
+    if phases is None:
+        return ()
+    if not isinstance(names, list | tuple):
+        message = f"attribute phase_names is {reprlib.repr(names)}; valid: a list of names"
+        raise DataError(path, demo, message)
+    if names and not np.isin(phases, np.arange(len(names))).all():
+        raise DataError(
+            path,
+            f"{demo}/phases",
+            f"holds {np.unique(phases).tolist()}; valid: 0 to {len(names) - 1}, the indices of "
+            "phase_names",
+        )
+    return tuple(map(str, names))
+
+
 def read_phases(path: Path, *, split: str) -> tuple[Tensor, tuple[str, ...]]:
     """The expert's phase at each step of the demonstrations.
 
@@ -129,19 +158,11 @@ def read_phases(path: Path, *, split: str) -> tuple[Tensor, tuple[str, ...]]:
     with open_episodes(path, split=split, observation_keys=[], extras=["phases"]) as episodes:
         for demo, episode in episodes.items():
             phases = np.asarray(episode.extras.get("phases", np.zeros(len(episode))))
-            found = tuple(map(str, episode.attributes.get("phase_names", ())))
-            found = found if "phases" in episode.extras else ()
+            found = phase_names(path, f"data/{demo}", episode)
             names = found if names is None else names
             if found != names:
                 raise DataError(
                     path, f"data/{demo}", f"phases are {found}; valid: {names}, as before"
-                )
-            if names and not np.isin(phases, np.arange(len(names))).all():
-                raise DataError(
-                    path,
-                    f"data/{demo}/phases",
-                    f"holds {np.unique(phases).tolist()}; valid: 0 to {len(names) - 1}, the "
-                    "positions in phase_names",
                 )
             parts.append(torch.as_tensor(phases).long())
     joined = torch.cat(parts)
@@ -278,14 +299,9 @@ def read_statistics(data_dir: Path, task: Task | None = None) -> ObservationStat
     name = None if task is None else task.name
     try:
         content = content if name is None else content["tasks"][name]
-        statistics = ObservationStatistics.from_lists(content)
-    except (AttributeError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        return ObservationStatistics.from_lists(content)
+    except (BMRLError, KeyError, TypeError) as error:
         raise DataError(path, name, f"not the statistics of a data set ({error})") from error
-    loc, scale = statistics.loc, statistics.scale
-    finite = torch.cat([loc.reshape(-1), scale.reshape(-1)]).isfinite().all()
-    if loc.shape != scale.shape or loc.ndim != 1 or not finite or not (scale > 0).all():
-        raise DataError(path, "scale", "valid: as many positive numbers as in loc, all finite")
-    return statistics
 
 
 def load_transitions(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import reprlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from math import prod
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_bmrl.data.arrays import refuse_pointer
-from torchrl_bmrl.errors import DataError
+from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.extras import needs
 
 with needs("data"):
@@ -284,18 +285,34 @@ def write_array(group: h5py.Group, key: str, array: np.ndarray, **options: Any) 
 
 
 def write_attributes(group: h5py.Group, attributes: Mapping[str, Any]) -> None:
-    """Writes numbers, texts and lists of them so that damage is detected when they are read."""
+    """Writes numbers, texts and lists of them so that damage is detected when they are read.
+
+    Raises:
+        ConfigError: for other attributes.
+    """
     for name, value in attributes.items():
-        texts = [value] if isinstance(value, str) else value
-        if isinstance(texts, list | tuple) and all(isinstance(text, str) for text in texts):
-            # Texts of fixed length lie in the group's header, which has a checksum. h5py's texts of
-            # variable length lie in a heap without one; if damaged, HDF5 may loop forever.
-            encoded = [text.encode() for text in texts]
-            length = max([1, *map(len, encoded)])
-            array = np.array(encoded if texts is value else encoded[0], dtype=f"S{length}")
-            group.attrs.create(name, array, dtype=h5py.string_dtype("utf-8", length))
-        else:
-            group.attrs[name] = value
+        try:
+            _write_attribute(group, name, value)
+        except (OverflowError, TypeError, ValueError) as error:
+            raise ConfigError(
+                f"attribute {name} is {reprlib.repr(value)}; valid: a number, a text, or a list of "
+                f"one of them ({error})"
+            ) from error
+
+
+def _write_attribute(group: h5py.Group, name: str, value: Any) -> None:
+    texts = [value] if isinstance(value, str) else value
+    if isinstance(texts, list | tuple) and all(isinstance(text, str) for text in texts):
+        # Texts of fixed length lie in the group's header, which has a checksum. h5py's texts of
+        # variable length lie in a heap without one; if damaged, HDF5 may loop forever.
+        encoded = [text.encode() for text in texts]
+        length = max([1, *map(len, encoded)])
+        array = np.array(encoded if texts is value else encoded[0], dtype=f"S{length}")
+        group.attrs.create(name, array, dtype=h5py.string_dtype("utf-8", length))
+    elif isinstance(value, h5py.Reference):
+        raise TypeError("it refers into another file")
+    else:
+        group.attrs[name] = value
 
 
 def _plain(value: Any) -> Any:
@@ -303,8 +320,13 @@ def _plain(value: Any) -> Any:
         return [_plain(element) for element in value.tolist()]
     if isinstance(value, bytes):
         return _text(value)
+    if isinstance(value, str):
+        return _text(value)
     return value.item() if isinstance(value, np.generic) else value
 
 
 def _text(value: Any) -> str:
-    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+    """Text that can be shown and written: what is not UTF-8 becomes U+FFFD."""
+    # h5py hides such bytes in a text of variable length.
+    raw = value if isinstance(value, bytes) else str(value).encode(errors="surrogateescape")
+    return raw.decode(errors="replace")

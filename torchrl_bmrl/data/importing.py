@@ -23,6 +23,7 @@ from torchrl_bmrl.data.sources import (
     with_bounds,
 )
 from torchrl_bmrl.errors import ConfigError, DataError
+from torchrl_bmrl.files import parse_json
 
 ORIGINAL_BOUNDS = "original_action_bounds"
 """Attribute of ``data``: the bounds that the actions had before they were scaled to [-1, 1]."""
@@ -281,7 +282,7 @@ def _parse(path: str | Path, text: object) -> Bounds | None:
     if text is None:
         return None
     try:
-        stated = json.loads(str(text))
+        stated = parse_json(str(text))
         return check_bounds((stated["low"], stated["high"]), ORIGINAL_BOUNDS)
     except (ValueError, KeyError, TypeError) as error:  # ConfigError is a ValueError
         message = f"attribute {ORIGINAL_BOUNDS} is {text!r}; valid: JSON with low and high"

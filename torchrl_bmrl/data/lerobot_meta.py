@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -11,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_bmrl.data.arrays import refuse_pointer
+from torchrl_bmrl.data.schema import MAX_FPS
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.extras import needs
-from torchrl_bmrl.files import read_json
+from torchrl_bmrl.files import parse_json, read_json
 
 _OLD, _NEW = ("v2.0", "v2.1"), ("v3.0",)
 _OLD_FILE = "data/chunk-{chunk:03d}/episode_{episode:06d}.parquet"
@@ -114,9 +114,9 @@ def _read_info(path: Path) -> dict[str, Any]:
         raise DataError(file, "codebase_version", message)
     if not isinstance(info.get("features"), dict):
         raise DataError(file, "features", "missing; valid: a JSON object")
+    # bool is an int in Python.
     fps, chunks_size = info.get("fps"), info.get("chunks_size", 1000)
-    # bool is an int in Python. Larger numbers are not rates, and may not fit a float.
-    if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 < fps < 1e9:
+    if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 < fps < MAX_FPS:
         raise DataError(file, "fps", f"{fps!r}; valid: a positive number")
     if not isinstance(chunks_size, int) or isinstance(chunks_size, bool) or chunks_size < 1:
         raise DataError(file, "chunks_size", f"{chunks_size!r}; valid: 1 or more")
@@ -139,13 +139,13 @@ def _read_lines(path: Path, name: str) -> list[dict[str, Any]]:
         # Not splitlines: texts may contain other line ends, such as U+2028.
         lines = file.read_text(encoding="utf-8").split("\n")
         for number, line in enumerate(lines, 1):
-            row = json.loads(line) if line.strip() else None
+            row = parse_json(line) if line.strip() else None
             if not isinstance(row, dict | None):
                 raise DataError(file, f"line {number}", "valid: a JSON object")
             rows += [] if row is None else [row]
     except DataError:
         raise
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise DataError(file, None, f"not JSON, a line for each episode ({error})") from error
     return rows
 

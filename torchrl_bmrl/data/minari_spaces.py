@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from torchrl_bmrl.data.hdf5 import DAMAGE, capacity, read_array, read_node
 from torchrl_bmrl.data.schema import FLOAT32
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.extras import needs
+from torchrl_bmrl.files import parse_json
 
 with needs("data"):
     import h5py
@@ -91,13 +91,13 @@ def read_spaces(path: str | os.PathLike[str]) -> Spaces:
     file = Path(path) / "data" / "metadata.json"
     try:
         refuse_pointer(file)
-        metadata = json.loads(file.read_bytes())
+        metadata = parse_json(file.read_bytes())
         data_format = metadata.get("data_format", "hdf5")
-        told = {"observations": json.loads(metadata["observation_space"])}
+        told = {"observations": parse_json(metadata["observation_space"])}
         if told["observations"]["type"] == "Dict":
             parts = told.pop("observations")["subspaces"]
             told = {f"observations/{part}": space for part, space in parts.items()}
-        actions = json.loads(metadata["action_space"])
+        actions = parse_json(metadata["action_space"])
         # Other spaces are skipped, as long as one part of the observation remains.
         known = {key: space for key, space in told.items() if space["type"] in _SPACES}
         for key, space in {**(told if not known else {}), "actions": actions}.items():
@@ -112,7 +112,7 @@ def read_spaces(path: str | os.PathLike[str]) -> Spaces:
         raise DataError(file, str(error.args[0]), "missing") from error
     except OSError as error:
         raise DataError(file, None, f"unreadable ({error.strerror})") from error
-    except (TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
         raise DataError(file, None, f"not Minari's metadata ({error})") from error
     if data_format != "hdf5":
         raise DataError(file, "data_format", f"{data_format!r}; valid: 'hdf5'")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import reduce
@@ -121,12 +122,12 @@ def check_bounds(bounds: Bounds, name: str = "bounds") -> Bounds:
     try:
         low, high = (np.asarray(bound, dtype=float) for bound in bounds)
         ordered = bool(np.all(low < high)) and max(low.ndim, high.ndim) < 2
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):  # such as a number of hundreds of digits
         ordered = False
     if not ordered or not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise ConfigError(
-            f"{name} is {bounds!r}; valid: two finite numbers, the lower first, or a list of one "
-            "for each dimension in place of either"
+            f"{name} is {reprlib.repr(bounds)}; valid: two finite numbers, the lower first, or a "
+            "list of one for each dimension in place of either"
         )
     return _plain(low), _plain(high)
 

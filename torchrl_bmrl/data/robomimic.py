@@ -34,7 +34,7 @@ from torchrl_bmrl.data.robomimic_reader import STEP_KEYS, open_data, open_episod
 from torchrl_bmrl.data.schema import check_episode, layout_of
 from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.extras import needs
-from torchrl_bmrl.files import atomic_path, write_atomic
+from torchrl_bmrl.files import atomic_path, parse_json, write_atomic
 
 with needs("data"):
     import h5py
@@ -177,7 +177,7 @@ def read_kept_episode(path: Path) -> Episode:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {key: file[key] for key in file}
-        attributes = json.loads(arrays.pop("attributes").tobytes())
+        attributes = parse_json(arrays.pop("attributes").tobytes())
 
         def group(prefix: str) -> dict[str, np.ndarray]:
             return {

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import re
+import reprlib
 from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
 from pathlib import Path
@@ -22,6 +22,7 @@ from torchrl_bmrl.data.hdf5 import (
 from torchrl_bmrl.data.options import check_bounds
 from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.extras import needs
+from torchrl_bmrl.files import parse_json
 
 with needs("data"):
     import h5py
@@ -147,7 +148,8 @@ def metadata_of(path: str | Path, file: h5py.File) -> dict[str, Any]:
         try:
             check_bounds((bounds["low"], bounds["high"]), "action_bounds")
         except (KeyError, ConfigError) as error:
-            message = f"attribute action_bounds is {bounds}; valid: low and high, low < high"
+            message = f"attribute action_bounds is {reprlib.repr(bounds)}"
+            message += "; valid: low and high, low < high"
             raise DataError(path, "data", message) from error
         attributes["action_bounds"] = bounds
     return attributes
@@ -155,7 +157,7 @@ def metadata_of(path: str | Path, file: h5py.File) -> dict[str, Any]:
 
 def _parse(path: str | Path, name: str, text: Any) -> dict[str, Any]:
     try:
-        parsed = json.loads(text)
+        parsed = parse_json(text)
     except (TypeError, ValueError) as error:
         raise DataError(path, "data", f"attribute {name} is not JSON ({error})") from error
     if not isinstance(parsed, dict):

@@ -18,6 +18,7 @@ from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
 from torchrl_bmrl.errors import BMRLError, DataError
+from torchrl_bmrl.files import read_json
 
 Device = torch.device | str | None
 MAP_NORESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)  # Python has the name from 3.13 on
@@ -153,7 +154,11 @@ class TaskSampler(Sampler):
 
     def loads(self, path: str | Path) -> None:
         """Loads what :meth:`dumps` wrote, as :meth:`load_state_dict` does."""
-        self.load_state_dict(json.loads((Path(path) / "sampler_metadata.json").read_text()))
+        file = Path(path) / "sampler_metadata.json"
+        state = read_json(file, "the state of a sampler")
+        if not isinstance(state, dict) or not {"sizes", "weights"} <= state.keys():
+            raise DataError(file, None, "valid: sizes and weights")
+        self.load_state_dict(state)
 
     def _empty(self) -> None:
         """Does nothing: the data sets stay."""

@@ -13,6 +13,8 @@ from torchrl_bmrl.data.options import Bounds
 from torchrl_bmrl.errors import ConfigError, DataError
 
 ACTION_TOLERANCE = 1e-6
+MAX_FPS = 1e9
+"""Larger numbers are not rates, and may not fit a float."""
 FLOAT32 = float(np.finfo(np.float32).max)
 
 Layout = dict[str, tuple[tuple[int, ...], np.dtype]]
@@ -197,5 +199,5 @@ def check_fps(fps: float) -> None:
     Raises:
         ConfigError: naming the value.
     """
-    if not isinstance(fps, int | float) or not 0 < fps < float("inf"):
-        raise ConfigError(f"fps is {fps!r}; valid: a positive number")
+    if not isinstance(fps, int | float) or not 0 < fps < MAX_FPS:
+        raise ConfigError(f"fps is {fps!r}; valid: a positive number below {MAX_FPS:g}")

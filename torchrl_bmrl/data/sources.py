@@ -17,6 +17,7 @@ from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
 from torchrl_bmrl.data.hdf5 import open_file, read_names
 from torchrl_bmrl.data.options import Bounds, ReadOptions, check_bounds, join_bounds
 from torchrl_bmrl.data.raw import Opened, RawEpisode, complete, success_fault
+from torchrl_bmrl.data.schema import MAX_FPS
 from torchrl_bmrl.data.source_files import Identity, identity_of
 from torchrl_bmrl.errors import ConfigError, DataError
 
@@ -72,7 +73,7 @@ class Source:
         for known in (self.metadata.get("fps"), rate):
             if isinstance(known, bool) or not isinstance(known, int | float):
                 continue
-            if 0 < known < float("inf"):
+            if 0 < known < MAX_FPS:
                 return float(known)
         return None
 
@@ -305,8 +306,10 @@ def _open_other(stack: ExitStack, path: Path, form: str, options: ReadOptions) -
 
 
 def _fits_attribute(value: Any) -> bool:
-    """Whether a value is a number, a text, or a list of numbers or of texts."""
+    """Whether a value is a number of 64 bits, a text, or a list of numbers or of texts."""
     values = value if isinstance(value, list) else [value]
+    if any(isinstance(x, int) and not -(2**63) <= x < 2**63 for x in values):
+        return False
     return any(all(isinstance(x, kind) for x in values) for kind in (str, int | float))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -142,12 +143,24 @@ class ObservationStatistics:
         Args:
             lists: ``loc`` and ``scale`` with the same length and, optionally, ``parts``.
 
+        Raises:
+            BMRLError: for other lists, and for a scale that is not above 0 in float32.
+
         Example:
             >>> ObservationStatistics.from_lists({"loc": [1.0], "scale": [2.0]}).scale
             tensor([2.])
         """
-        parts = lists.get("parts")
-        loc, scale = (torch.tensor(lists[name], dtype=torch.float) for name in ("loc", "scale"))
+        try:
+            loc, scale = (torch.tensor(lists[name], dtype=torch.float) for name in ("loc", "scale"))
+            parts = lists.get("parts")
+        except (AttributeError, KeyError, OverflowError, RuntimeError, TypeError, ValueError):
+            raise BMRLError(f"{reprlib.repr(lists)}; valid: lists loc and scale") from None
+        fits = loc.shape == scale.shape and loc.ndim == 1
+        if not (fits and loc.isfinite().all() and scale.isfinite().all() and (scale > 0).all()):
+            raise BMRLError("scale: valid: as many positive numbers as in loc, all finite")
+        named = isinstance(parts, list | None) and all(isinstance(x, str) for x in parts or ())
+        if not named:
+            raise BMRLError(f"parts is {reprlib.repr(parts)}; valid: names")
         return cls(loc, scale, None if parts is None else tuple(parts))
 
     def to_lists(self) -> dict[str, Any]:

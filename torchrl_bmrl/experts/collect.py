@@ -22,8 +22,7 @@ from torchrl_bmrl.data.robomimic import (
 )
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
 from torchrl_bmrl.experts.settings import Experts, ExpertSettings, experts_of
-from torchrl_bmrl.files import check_no_linked_folders
-from torchrl_bmrl.run.locks import lock
+from torchrl_bmrl.run.locks import check_no_linked_folders, lock
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
 from torchrl_bmrl.tasks import Task, get_task
 

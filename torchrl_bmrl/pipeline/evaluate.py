@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from itertools import cycle
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
@@ -18,10 +19,11 @@ from torchrl.envs.transforms import Transform
 from torchrl_bmrl.data.demonstrations import has_contexts, read_demonstrations, read_phases
 from torchrl_bmrl.data.robomimic_file import MASKS
 from torchrl_bmrl.envs.transforms import ObservationStatistics
-from torchrl_bmrl.errors import ConfigError, RenderError
+from torchrl_bmrl.errors import CheckpointError, ConfigError, RenderError
 from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
 from torchrl_bmrl.experts.settings import ExpertSettings
+from torchrl_bmrl.files import check_rows
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.pipeline.held_out import evaluate_held_out
 from torchrl_bmrl.pipeline.run import Run
@@ -172,6 +174,13 @@ def evaluate_once(
     name = "-".join(filter(None, (task, policy, source)))
     episodes = run.settings.evaluate.episodes
 
+    def read(path: Path) -> list[ResultRow]:
+        rows = read_results(path)
+        known = {"task": task, "policy": policy, "latent_source": source, "seed": run.settings.seed}
+        expected = [{**known, "episode": i} for i in range(max(1, len(rows)))]
+        check_rows(path, [asdict(row) for row in rows], expected)
+        return rows
+
     def make(path: Path) -> None:
         outcomes = play([run.seed(starts, task, i) for i in range(episodes)])
         rows = [
@@ -191,7 +200,7 @@ def evaluate_once(
 
     return run.once(
         f"{folder}/{name}.csv",
-        read_results,
+        read,
         make,
         skipped=lambda: report(episodes * run.horizon(run.task(task))),
     )
@@ -232,7 +241,18 @@ def held_out_episode(run: Run, name: str) -> TensorDictBase:
     """Returns the demonstration for the source ``demonstration``; exported policies contain one."""
     if run.settings.evaluate.policy:
         state, _ = load_checkpoint(run.student_path, kind="student")
-        return TensorDict(state["demonstrations"][name]).auto_batch_size_(1)
+        _, metadata = run.student()
+        try:
+            found = TensorDict(state["demonstrations"][name]).auto_batch_size_(1)
+            sizes = [found[key].shape[-1] for key in TRANSITION_KEYS]
+        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            message = f"its demonstration of {name} is missing or damaged ({error})"
+            raise CheckpointError(run.student_path, message) from error
+        dims = [metadata["student"][key] for key in ("observation_dim", "action_dim")]
+        if sizes != [*dims, 1, dims[0]]:
+            message = f"its demonstration of {name} has rows of {sizes} numbers"
+            raise CheckpointError(run.student_path, f"{message}; valid: {[*dims, 1, dims[0]]}")
+        return found
     data = run.transitions(name, "valid")
     return data[data["episode"] == data["episode"].min()]
 

@@ -94,7 +94,7 @@ def held_out_job(job: tuple[Run, str], report: Report) -> dict[str, str | float]
     run, name = job
     (row,) = run.once(
         f"evaluation/{name}-held_out.csv",
-        partial(read_rows, columns=COLUMNS),
+        partial(read_rows, columns=COLUMNS, expected=[{"task": name}]),
         lambda path: write_rows(path, [_held_out(run, name, report)]),
         skipped=lambda: report(2 * _critic_updates(run)),
     )

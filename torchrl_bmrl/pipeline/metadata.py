@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import math
 import re
 import reprlib
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from torchrl_bmrl.envs.transforms import ObservationStatistics
-from torchrl_bmrl.errors import CheckpointError
+from torchrl_bmrl.errors import BMRLError, CheckpointError
 
 
 def is_number(x: Any) -> bool:
     """Whether it is a finite number."""
-    return isinstance(x, float | int) and math.isfinite(x)
+    return isinstance(x, float | int) and abs(x) <= sys.float_info.max
 
 
 def is_name(x: Any) -> bool:
@@ -28,20 +28,21 @@ def is_task_name(x: Any) -> bool:
     return is_name(x) and re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", x) is not None
 
 
-def are_statistics(x: Any) -> bool:
-    """Whether they are an observation's mean and scale."""
+def are_statistics(x: Any, size: int) -> bool:
+    """Whether they are mean and scale of an observation of this size."""
     if not isinstance(x, dict) or set(x) - {"parts"} != {"loc", "scale"}:
         return False
     parts = x.get("parts", [])
     if not isinstance(parts, list) or not all(map(is_name, parts)):
         return False
-    lists = isinstance(x["loc"], list) and isinstance(x["scale"], list)
-    return (
-        lists
-        and len(x["loc"]) == len(x["scale"])
-        and all(map(is_number, [*x["loc"], *x["scale"]]))
-        and all(scale > 0 for scale in x["scale"])
-    )
+    if not all(
+        isinstance(x[key], list) and all(map(is_number, x[key])) for key in ("loc", "scale")
+    ):
+        return False
+    try:
+        return len(ObservationStatistics.from_lists(x).loc) == size
+    except BMRLError:
+        return False
 
 
 def check_statistics(
@@ -58,7 +59,7 @@ def check_statistics(
         CheckpointError: if it was trained with other statistics, or does not tell them.
     """
     own: Any = metadata.get("statistics")
-    if not are_statistics(own):
+    if not are_statistics(own, len(statistics.loc)):
         raise CheckpointError(path, f"statistics are {reprlib.repr(own)}; valid: loc and scale")
     if not statistics.close_to(ObservationStatistics.from_lists(own)):
         raise CheckpointError(

@@ -372,7 +372,10 @@ def load_student(path: Path) -> tuple[Student, dict[str, Any]]:
             lambda x: x is None or (is_number(x) and 0 <= x <= 1),
             "a number between 0 and 1, or null without a classifier",
         ),
-        "statistics": (are_statistics, "loc and scale, as many numbers in each, scale above 0"),
+        "statistics": (
+            lambda x: are_statistics(x, metadata["student"]["observation_dim"]),
+            "loc and scale, a number for each of the observation, scale above 0",
+        ),
     }
     for key, (holds, what) in valid.items():
         if not holds(metadata.get(key)):

@@ -87,7 +87,7 @@ def _read(path: Path) -> Section:
         explorer = None
         if content.get("explorer"):  # studies of earlier versions say nothing of it
             figure = _figure(path, path.name)
-            explorer = StoredExplorer(**json.loads(figure.read_text(encoding="utf-8")))
+            explorer = StoredExplorer(**read_json(figure, "the explorer of a study"))
         return Section(
             heading=content["heading"],
             explorer=explorer,

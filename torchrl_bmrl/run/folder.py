@@ -260,12 +260,16 @@ def read_yaml(path: Path) -> dict[str, Any]:
         content = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except (FileNotFoundError, IsADirectoryError) as error:
         raise DataError(path, None, "no such file") from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    # PyYAML raises the last ones for tags that do not fit their values.
+    except (yaml.YAMLError, ValueError, RecursionError, *_ODD_TAGS) as error:
         raise DataError(path, None, f"not YAML ({' '.join(str(error).split())})") from error
     if not isinstance(content, dict):
         found = "is empty" if content is None else f"contains a {type(content).__name__}"
         raise DataError(path, None, f"{found}; valid: a mapping")
     return content
+
+
+_ODD_TAGS = (AttributeError, LookupError, TypeError)
 
 
 class _Loader(yaml.SafeLoader):

@@ -10,9 +10,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchrl_bmrl.errors import FolderInUseError
+from torchrl_bmrl.errors import DataError, FolderInUseError
 from torchrl_bmrl.extras import needs
-from torchrl_bmrl.files import check_no_linked_folders, write_atomic
+from torchrl_bmrl.files import parse_json, write_atomic
 from torchrl_bmrl.run.folder import INPUTS, Files, open_run
 
 with needs("recipes"):
@@ -58,6 +58,34 @@ def lock(folder: Path, names: Sequence[str] = ("run",)) -> Iterator[None]:
                 raise FolderInUseError(folder, *_owner(owner_file)) from None
             write_atomic(owner_file, json.dumps(owner) + "\n")
         yield
+
+
+def check_no_linked_folders(folder: str | os.PathLike[str]) -> None:
+    """Checks that no folder inside of a folder is a link: files elsewhere would change through it.
+
+    Files may be links, because they are replaced and never modified. The folders ``wandb`` are left
+    out: Weights & Biases links its newest run.
+
+    Args:
+        folder: The folder, which may be a link itself, or missing.
+
+    Raises:
+        DataError: naming the first link.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> (folder / "bcq").symlink_to(tempfile.mkdtemp())
+        >>> check_no_linked_folders(folder)
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.DataError: .../bcq: is a link to /...; valid: a folder, ...
+    """
+    for path in sorted(Path(folder).rglob("*")):
+        inside = path.relative_to(folder).parts[:-1]
+        if path.is_symlink() and path.is_dir() and "wandb" not in inside:
+            message = f"is a link to {path.resolve()}; valid: a folder, as files would change there"
+            raise DataError(path, None, message)
 
 
 @contextlib.contextmanager
@@ -126,7 +154,7 @@ def _remove(paths: set[Path], folders: Sequence[Path]) -> None:
 
 def _owner(path: Path) -> tuple[str, str]:
     try:
-        owner = json.loads(path.read_text(encoding="utf-8"))
+        owner = parse_json(path.read_text(encoding="utf-8"))
         return str(owner["process"]), str(owner["host"])
     except (OSError, ValueError, KeyError, TypeError):  # locked, and the file not yet written
         return "unknown", "an unknown host"

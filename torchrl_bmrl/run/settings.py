@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import math
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from operator import ge, gt, le
 from types import UnionType
@@ -124,7 +124,7 @@ def _check(name: str, value: Any, valid: Mapping[str, Any]) -> None:
 
 def _is_within(number: float, limits: Sequence[tuple[str, Any, float]]) -> bool:
     within = all(compare(number, limit) for _, compare, limit in limits)
-    return within and (not limits or math.isfinite(number))
+    return within and (not limits or abs(number) <= sys.float_info.max)
 
 
 def _items(name: str, value: Any) -> Iterator[tuple[str, Any]]:

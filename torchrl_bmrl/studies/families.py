@@ -7,7 +7,7 @@ of another behaviour, its own first episode, the nearest trained member, or noth
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -250,10 +250,12 @@ def play_member(job: tuple[Run, Job], report: Report) -> list[dict[str, Any]]:
     rows = []
     for method in settings.methods:
         steps = settings.episodes * run.horizon(task)
+        first = {"family": run.family.name, "method": method, "split": split, "member": task.name}
+        episodes = [{**first, "episode": i} for i in range(settings.episodes)]
         rows += run.once(
             f"{settings.folder}/{method}/{task.name}.csv",
-            partial(read_rows, columns=_COLUMNS),
-            partial(_play, run, settings, split, task, method, returns, report),
+            partial(read_rows, columns=_COLUMNS, expected=episodes),
+            partial(_play, run, settings, task, method, episodes, returns, report),
             skipped=partial(report, steps),
         )
     return rows
@@ -277,9 +279,9 @@ def data_return(run: Run, settings: FamilySettings, task: Task, index: int) -> f
 def _play(
     run: Run,
     settings: FamilySettings,
-    split: str,
     task: Task,
     method: str,
+    episodes: Sequence[Mapping[str, Any]],
     returns: Sequence[float | str],
     report: Report,
     path: Path,
@@ -287,15 +289,13 @@ def _play(
     seeds = [run.seed("families", task.name, i) for i in range(settings.episodes)]
     policy, source = make_method(run, settings, task, method)
     outcomes = run.play(task, policy, source, seeds=seeds, report=report)
-    first = {"family": run.family.name, "method": method, "split": split, "member": task.name}
     rows = [
         {
-            **first,
-            "episode": i,
+            **known,
             "return": outcome.episode_return,
             "success": "" if outcome.success is None else int(outcome.success),
             "data_return": data,
         }
-        for i, (outcome, data) in enumerate(zip(outcomes, returns, strict=True))
+        for known, outcome, data in zip(episodes, outcomes, returns, strict=True)
     ]
     write_rows(path, rows)

@@ -53,6 +53,12 @@ def play_line(
     """Episodes along one line, played once: ``share`` of the way, and what was measured."""
     run, (settings, code, (start, end)) = job
 
+    shares = torch.linspace(0, 1, POINTS).repeat_interleave(settings.episodes)
+    places = [
+        {"code": code, "start": start, "end": end, "share": x, "episode": i % settings.episodes}
+        for i, x in enumerate(shares.tolist())
+    ]
+
     def play(path: Path) -> None:
         path_of = {"m": run.student_path}
         other = run.folder / settings.folder / code / "checkpoint.safetensors"
@@ -63,7 +69,6 @@ def play_line(
         )
         first, last = (student.prototypes[run.names.index(name)] for name in (start, end))
         task, family = run.task(start), run.family
-        shares = torch.linspace(0, 1, POINTS).repeat_interleave(settings.episodes)
         points = torch.lerp(first, last, shares.unsqueeze(-1)).unsqueeze(1)
         seeds = [run.seed("families", "line", start, i) for i in range(settings.episodes)]
         transform = PathTaskLatent(points)
@@ -81,20 +86,16 @@ def play_line(
         low, high = (torch.tensor(family.parameter(name)).double() for name in (start, end))
         rows = [
             {
-                "code": code,
-                "start": start,
-                "end": end,
-                "share": share,
-                "episode": i % settings.episodes,
+                **place,
                 "measured": along(torch.tensor(family.measure(o)), low, high, family.period),
             }
-            for i, (share, o) in enumerate(zip(shares.tolist(), observations, strict=True))
+            for place, o in zip(places, observations, strict=True)
         ]
         write_rows(path, rows)
 
     return run.once(
         f"{settings.folder}/lines/{code}-{start}-{end}.csv",
-        partial(read_rows, columns=COLUMNS),
+        partial(read_rows, columns=COLUMNS, expected=places),
         play,
         skipped=lambda: report(POINTS * settings.episodes * run.horizon(run.task(start))),
     )

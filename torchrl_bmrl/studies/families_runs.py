@@ -8,16 +8,17 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from torchrl_bmrl.errors import ConfigError, DataError
+from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
 from torchrl_bmrl.evaluation.results import name
 from torchrl_bmrl.families import SPLITS, registered_families
 from torchrl_bmrl.files import finite, one_of, or_nothing, read_rows, whole
 from torchrl_bmrl.pipeline.settings import Settings
 from torchrl_bmrl.reports import Table
 from torchrl_bmrl.run.folder import deciding, read_settings
+from torchrl_bmrl.run.settings import check_settings
 from torchrl_bmrl.studies.families import METHODS, FamilySettings
 from torchrl_bmrl.studies.families_line import COLUMNS as LINE_COLUMNS
-from torchrl_bmrl.studies.families_line import line_table
+from torchrl_bmrl.studies.families_line import LINES, line_table
 from torchrl_bmrl.studies.families_report import make_tables
 from torchrl_bmrl.tasks import FAMILIES
 
@@ -73,6 +74,13 @@ def read_study(run_dir: str | Path) -> FinishedStudy:
     settings = deciding(asdict(Settings())) | deciding(read_settings(run_dir))
     seed = settings.pop("seed")
     of_study = asdict(FamilySettings()) | read_settings(folder)
+    known = {key: x for key, x in of_study.items() if key in asdict(FamilySettings())}
+    try:
+        check_settings(FamilySettings(**known), "families.")
+        if not isinstance(known["episodes"], int):
+            raise ConfigError(f"families.episodes is {known['episodes']}; valid: a whole number")
+    except BMRLError as error:
+        raise DataError(folder / "config.yaml", None, str(error)) from error
     study = {f"families.{key}": x for key, x in deciding(of_study).items()}
     path = folder / "results.csv"
     rows = read_rows(path, _COLUMNS)
@@ -92,16 +100,19 @@ def read_study(run_dir: str | Path) -> FinishedStudy:
         )
     if len(found) > len(wanted):
         raise DataError(path, "episode", "an episode is there twice; valid: once")
-    lines = folder / "lines.csv"
+    path = folder / "lines.csv"
+    lines = read_rows(path, LINE_COLUMNS) if path.exists() else []
+    for code in LINES if lines else ():
+        if not any(row["code"] == code and 0.25 <= row["share"] <= 0.75 for row in lines):
+            message = f"no row of {code} in the middle of a line; recipes/families.py writes them"
+            raise DataError(path, "code", message)
     return FinishedStudy(
         run_dir=run_dir,
         family=families.pop(),
         seed=seed,
         settings=settings | study,
         rows=[{"run": str(run_dir), **row} for row in rows],
-        lines=[{"run": str(run_dir), **row} for row in read_rows(lines, LINE_COLUMNS)]
-        if lines.exists()
-        else [],
+        lines=[{"run": str(run_dir), **row} for row in lines],
     )
 
 

@@ -153,7 +153,7 @@ def evaluate_job(job: tuple[Run, tuple[str, int, FQESettings]], report: Report) 
     run, (name, updates, settings) = job
     (row,) = run.once(
         f"fqe/{name}/{updates}.csv",
-        partial(read_rows, columns=COLUMNS),
+        partial(read_rows, columns=COLUMNS, expected=[{"task": name, "updates": updates}]),
         lambda path: write_rows(path, [_evaluate(run, name, updates, settings, report)]),
         skipped=lambda: report(_units(run, name, settings)),
     )

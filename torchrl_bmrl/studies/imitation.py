@@ -151,22 +151,24 @@ def play_job(job: tuple[Run, Job], report: Report) -> list[dict[str, Any]]:
     task = run.composition(settings.composition)
     count = settings.episodes // settings.demonstrations
 
+    first = {"method": method, "perturbation": perturbation, "demonstration": number}
+    episodes = [{**first, "episode": i} for i in range(count)]
+
     def play(path: Path) -> None:
         policy, sources = make_method(run, settings, method, number)
         transforms = [*sources, *make_perturbation(settings, perturbation)]
         seeds = [run.seed("imitate", number, i) for i in range(count)]
         outcomes = run.play(task, policy, *transforms, seeds=seeds, report=report)
-        first = {"method": method, "perturbation": perturbation, "demonstration": number}
         rows = [
-            {**first, "episode": i, "stages": outcome.stages, "success": int(outcome.success or 0)}
-            for i, outcome in enumerate(outcomes)
+            {**known, "stages": outcome.stages, "success": int(outcome.success or 0)}
+            for known, outcome in zip(episodes, outcomes, strict=True)
         ]
         write_rows(path, rows)
 
     name = f"{method}-{perturbation}-{number}".replace(" ", "_").replace(",", "")
     return run.once(
         f"{settings.folder}/{name}.csv",
-        partial(read_rows, columns=_COLUMNS),
+        partial(read_rows, columns=_COLUMNS, expected=episodes),
         play,
         skipped=lambda: report(count * run.horizon(task)),
     )

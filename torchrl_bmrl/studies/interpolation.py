@@ -27,7 +27,16 @@ from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation.behaviour import matching_noise
 from torchrl_bmrl.evaluation.paths import data_path, straight_path, switched_path
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
-from torchrl_bmrl.files import number, read_rows, whole, write_rows
+from torchrl_bmrl.files import (
+    check_rows,
+    finite,
+    flag,
+    number,
+    one_of,
+    read_rows,
+    whole,
+    write_rows,
+)
 from torchrl_bmrl.modules import BCQPolicy, PathTaskLatent
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.reports import Section, write_study
@@ -268,7 +277,7 @@ def play_job(
     paths = {part: run.folder / settings.folder / f"{part}.csv" for part in _parts(name)}
     if all(path.exists() for path in paths.values()):
         report(_num_steps(run, settings, name))
-        return {part: read_episodes(path) for part, path in paths.items()}
+        return {part: read_episodes(path, run.names) for part, path in paths.items()}
     embedding, task, noise = Embedding(run, settings), _task(settings, name), 0.0
     if name in SWITCHES:
         points, leaving = embedding.switches(name)
@@ -284,7 +293,7 @@ def play_job(
         noisy = play(embedding, task, points, report, noise=noise)
         write_episodes(paths[f"{name}_noise"], noisy, unknown, nowhere)
     write_episodes(paths[name], played, along, labels)
-    return {part: read_episodes(path) for part, path in paths.items()}
+    return {part: read_episodes(path, run.names) for part, path in paths.items()}
 
 
 def _parts(name: str) -> list[str]:
@@ -371,12 +380,17 @@ def write_episodes(
     write_rows(path, [row(i, t) for i in range(count) for t in range(length)])
 
 
-def read_episodes(path: Path) -> Episodes:
+def read_episodes(path: Path, tasks: Sequence[str]) -> Episodes:
     """Reads a file of :func:`write_episodes` as arrays ``(N, T, ...)``; labels are ``(N,)``."""
     measured = ("along", "deviation", "success")
-    numbers = dict.fromkeys((*POSITIONS["eef"], *POSITIONS["cube"], *measured), number)
-    rows = read_rows(path, {"episode": whole, "label": str, **numbers})
-    count = 1 + max(row["episode"] for row in rows)
+    numbers = dict.fromkeys((*POSITIONS["eef"], *POSITIONS["cube"], "deviation"), finite)
+    label = whole if path.stem in SWITCHES else one_of("", *tasks)
+    columns = {"episode": whole, "step": whole, "label": label, "along": number, "success": flag}
+    rows = read_rows(path, columns | numbers)
+    count = max(1, len({row["episode"] for row in rows}))
+    length = max(1, len(rows) // count)
+    steps = [{"episode": i, "step": t} for i in range(count) for t in range(length)]
+    check_rows(path, rows, steps)
     values = {key: np.array([row[key] for row in rows]).reshape(count, -1) for key in rows[0]}
     positions = {
         key: np.stack([values[column] for column in columns], -1)

@@ -64,7 +64,7 @@ def share_of_neither(task: str, episodes: Episodes, tasks: Episodes) -> str:
         for other in {label for label, _ in labels}
     }
     outcomes = zip(episodes["label"], cube_outcomes(moved(episodes, "cube")), strict=True)
-    neither = [outcome not in (usual[task], usual[label]) for label, outcome in outcomes]
+    neither = [outcome not in (usual.get(task), usual.get(label)) for label, outcome in outcomes]
     return f"{np.mean(neither):.0%}"
 
 

@@ -25,7 +25,7 @@ from torchrl.objectives import SACLoss, SoftUpdate
 from torchrl_bmrl.envs.transforms import StageReward
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
-from torchrl_bmrl.files import finite, read_rows, whole, write_rows
+from torchrl_bmrl.files import check_rows, finite, read_rows, whole, write_rows
 from torchrl_bmrl.modules import HeldTaskLatent, task_latent_box
 from torchrl_bmrl.modules.generator import Network, make_mlp
 from torchrl_bmrl.pipeline.run import Run
@@ -132,6 +132,7 @@ def train_job(job: tuple[Run, tuple[LatentSACSettings, str, int]], report: Repor
     path = run.folder / settings.folder / f"{variant}-seed{seed}.csv"
     if path.exists():
         rows = read_rows(path, COLUMNS)
+        check_rows(path, rows, [{"variant": variant, "seed": seed}] * max(1, len(rows)))
         if rows[-1]["environment_steps"] >= settings.environment_steps:
             report(settings.environment_steps)
             return rows

@@ -19,7 +19,7 @@ from torch.optim import Adam
 from torchrl_bmrl import __version__
 from torchrl_bmrl.errors import CheckpointError
 from torchrl_bmrl.extras import needs
-from torchrl_bmrl.files import link_or_copy, write_atomic
+from torchrl_bmrl.files import link_or_copy, parse_json, write_atomic
 from torchrl_bmrl.training import get_rng_state, load_adam, set_rng_state
 
 with needs("recipes"):
@@ -183,7 +183,7 @@ def _read(path: Path) -> tuple[State, Metadata]:
         raise CheckpointError(path, "no such checkpoint")
     try:
         with safetensors.safe_open(path, "pt") as file:
-            header = json.loads((file.metadata() or {})[_HEADER])
+            header = parse_json((file.metadata() or {})[_HEADER])
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
         if header[_SUM] != _checksum(header, tensors):
             raise ValueError("the checksum differs")
