@@ -24,8 +24,9 @@ import mujoco
 
 from torchrl_bmrl.data.recordings import _kinematic_xml
 from torchrl_bmrl.envs import rendering
-from torchrl_bmrl.envs.compiling import check_assets, compile_scene
-from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.envs.assets import find_assets
+from torchrl_bmrl.envs.compiling import compile_scene
+from torchrl_bmrl.errors import DataError
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that are copies")
 ASSETS = Path(next(iter(find_spec("robosuite").submodule_search_locations)), "models", "assets")
@@ -98,17 +99,17 @@ def test_a_compilation_ends_with_the_process_that_started_it() -> None:
 # -- files that scenes read ------------------------------------------------------------------------
 
 
-def scene(name: str, file: str) -> ET.Element:
-    return ET.fromstring(f"<mujoco><asset><mesh {name}='{file}'/></asset></mujoco>")
+def scene(name: str, file: str) -> str:
+    return f"<mujoco><asset><mesh {name}='{file}'/></asset></mujoco>"
 
 
 @pytest.mark.parametrize("name", ["file", "fileright"])
 def test_a_scene_reads_files_of_the_installed_simulator_alone(name: str, tmp_path: Path) -> None:
-    check_assets(scene(name, f"{ASSETS}/arenas/../textures/ceramic.png"))
+    find_assets(scene(name, f"{ASSETS}/arenas/../textures/ceramic.png"))
     own = tmp_path / "own.stl"
     for file in (own, "own.stl", f"{ASSETS}/../../../own.stl", f"{ASSETS}/../../__init__.py"):
-        with pytest.raises(BMRLError, match=r"a scene reads '.*'; valid: files in robosuite's"):
-            check_assets(scene(name, str(file)))
+        with pytest.raises(DataError, match=r"not a file of robosuite, .*; valid: files in robo"):
+            find_assets(scene(name, str(file)))
 
 
 def test_a_recording_s_model_keeps_no_element_that_reads_files_or_multiplies_others() -> None:

@@ -32,6 +32,7 @@ from torchrl_bmrl.data.options import Bounds, check_bounds
 from torchrl_bmrl.data.robomimic_file import MASKS, count_episodes, count_steps, read_metadata
 from torchrl_bmrl.data.robomimic_reader import STEP_KEYS, open_data, open_episodes
 from torchrl_bmrl.data.schema import check_episode, layout_of
+from torchrl_bmrl.envs.assets import shorten_paths
 from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.extras import needs
 from torchrl_bmrl.files import atomic_path, parse_json, write_atomic
@@ -150,7 +151,10 @@ def _write_episode(demo: h5py.Group, episode: Episode) -> None:
     }
     for key, array in arrays.items():
         write_array(demo, key, array)
-    write_attributes(demo, {"num_samples": len(episode), **episode.attributes})
+    attributes = dict(episode.attributes)
+    if isinstance(model := attributes.get("model_file"), str):
+        attributes["model_file"] = shorten_paths(model)
+    write_attributes(demo, {"num_samples": len(episode), **attributes})
 
 
 def keep_episode(path: Path, episode: Episode) -> None:

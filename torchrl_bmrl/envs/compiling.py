@@ -13,12 +13,9 @@ import sys
 import tempfile
 import time
 import warnings
-import xml.etree.ElementTree as ET
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.extras import needs
 
 if sys.platform != "win32":
@@ -26,31 +23,6 @@ if sys.platform != "win32":
 
 _WAIT = 60
 """Longest wait for a second of a compilation [s], on a machine that has much else to do."""
-
-
-def check_assets(root: ET.Element) -> None:
-    """Checks that a scene reads only files that the installed robosuite contains.
-
-    Args:
-        root: of the MJCF.
-
-    Raises:
-        BMRLError: naming the first other file.
-    """
-    spec = find_spec("robosuite")
-    places = (spec and spec.submodule_search_locations) or ()
-    folders = [Path(place, "models", "assets").resolve() for place in places]
-    for element in root.iter():
-        for name, value in element.items():
-            if not name.startswith("file"):
-                continue
-            path = Path(value)
-            if not path.is_absolute() or not any(
-                path.resolve().is_relative_to(folder) for folder in folders
-            ):
-                raise BMRLError(
-                    f"a scene reads {value!r}; valid: files in robosuite's models/assets"
-                )
 
 
 def compile_scene(text: str, *, seconds: int = 7, memory: int = 2**31) -> Any:

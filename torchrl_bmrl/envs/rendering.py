@@ -16,12 +16,13 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_bmrl.envs.compiling import check_assets, compile_scene, end_with_parent
+from torchrl_bmrl.envs.assets import find_assets
+from torchrl_bmrl.envs.compiling import compile_scene, end_with_parent
 from torchrl_bmrl.errors import BMRLError, RenderError
 from torchrl_bmrl.extras import needs
 
@@ -30,6 +31,8 @@ GOAL_MARKER = "goal_marker"
 
 _CONTEXTS = ("egl", "osmesa", "glfw")
 """Modules of mujoco with a GL context; the names are also values of ``MUJOCO_GL``."""
+_NOT_A_SCENE = 3
+"""Exit code of the subprocess."""
 _START = f"""
 import sys
 from importlib.util import module_from_spec, spec_from_file_location
@@ -67,7 +70,8 @@ def render_states(
         the pictures of each episode, shape ``(T, size, size, 3)``.
 
     Raises:
-        BMRLError: if states have another shape or are not finite.
+        BMRLError: if a model does not compile, or states have another shape or are not finite.
+        DataError: naming a mesh or texture that is missing.
         RenderError: with each library's error, if none works.
 
     Example:
@@ -77,7 +81,9 @@ def render_states(
     for _, states in scenes:
         if states.ndim != 2 or not np.isfinite(states).all():
             raise BMRLError(f"states must be finite, of shape (T, n), got {states.shape}")
-    return _rendered(scenes, size, report)[1] if scenes else []
+    # Before any library is tried: a missing mesh is none's fault.
+    found = [(find_assets(model), states) for model, states in scenes]
+    return _rendered(found, size, report)[1] if found else []
 
 
 @cache
@@ -184,6 +190,8 @@ def _run(library: str, arguments: list[str], report: Callable[[int], Any]) -> st
         report(-made)
         errors.seek(0)
         lines = errors.read().strip().splitlines()
+        if process.returncode == _NOT_A_SCENE:
+            raise BMRLError(lines[-1])
     return lines[-1] if lines else f"the process ended with code {process.returncode}"
 
 
@@ -205,7 +213,6 @@ def _render(parent: str, task: str, result: str) -> None:
         for number, text in enumerate(scenes["models"]):
             # Compiling takes seconds, and scenes differ only in the marker's position.
             root = ET.fromstring(str(text))
-            check_assets(root)
             marker = root.find(f".//site[@name='{GOAL_MARKER}']")
             place = None if marker is None else np.array(marker.get("pos", "0 0 0").split(), float)
             if marker is not None:
@@ -215,13 +222,27 @@ def _render(parent: str, task: str, result: str) -> None:
                 if made is not None:
                     made[-1].close()
                 known, made = key, None
-                made = _make_renderer(mujoco, key, size)
+                try:
+                    model = compile_scene(key)
+                except ValueError as error:
+                    reason = " ".join(str(error).split())
+                    _refuse(f"the model of a scene does not compile ({reason})")
+                made = _make_renderer(mujoco, model, size)
             assert made is not None
+            states, width = scenes[f"states{number}"], 1 + made[0].nq + made[0].nv
+            if states.shape[1] != width:
+                _refuse(f"states are of shape {states.shape}; valid: (T, {width}) for their model")
             if place is not None:
                 made[0].site(GOAL_MARKER).pos[:] = place
-            pictures = _pictures(mujoco, made, scenes[f"states{number}"], camera, options)
+            pictures = _pictures(mujoco, made, states, camera, options)
             frames[f"frames{number}"] = np.array(pictures, np.uint8).reshape(-1, size, size, 3)
     np.savez(result, **frames)
+
+
+def _refuse(message: str) -> NoReturn:
+    """Ends the subprocess: the scene is at fault, and no other library would draw it."""
+    print(message, file=sys.stderr)
+    sys.exit(_NOT_A_SCENE)
 
 
 def _pictures(
@@ -241,8 +262,7 @@ def _pictures(
     return pictures
 
 
-def _make_renderer(mujoco: Any, text: str, size: int) -> tuple[Any, Any, Any]:
-    model = compile_scene(text)
+def _make_renderer(mujoco: Any, model: Any, size: int) -> tuple[Any, Any, Any]:
     model.vis.quality.offsamples = 0  # no antialiasing: a third of the time
     model.vis.quality.shadowsize = 0  # 64 MB for shadows that are not drawn
     for index in range(model.nsite):

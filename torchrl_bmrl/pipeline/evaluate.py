@@ -19,7 +19,7 @@ from torchrl.envs.transforms import Transform
 from torchrl_bmrl.data.demonstrations import has_contexts, read_demonstrations, read_phases
 from torchrl_bmrl.data.robomimic_file import MASKS
 from torchrl_bmrl.envs.transforms import ObservationStatistics
-from torchrl_bmrl.errors import CheckpointError, ConfigError, RenderError
+from torchrl_bmrl.errors import BMRLError, CheckpointError, ConfigError, StoppedError
 from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
 from torchrl_bmrl.experts.settings import ExpertSettings
@@ -138,7 +138,9 @@ def films_of(run: Run, report: Report | None = None) -> Films:
 
     try:
         return run.once("evaluation/films.json", read_films, make)
-    except RenderError as error:
+    except StoppedError:
+        raise
+    except BMRLError as error:  # without a renderer, or a mesh
         return Films(note=f"{error}.")
 
 

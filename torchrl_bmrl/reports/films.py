@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_bmrl.data.demonstrations import demonstration_path
+from torchrl_bmrl.data.demonstrations import demonstration_path, phase_names
 from torchrl_bmrl.data.robomimic import open_episodes
 from torchrl_bmrl.data.robomimic_file import read_metadata
 from torchrl_bmrl.data.sources import Source
@@ -82,7 +82,7 @@ def film_demonstrations(
                 if "states" in episode.extras and "model_file" in episode.attributes:
                     states = episode.extras["states"][: len(episode) : EVERY]
                     moments += [(task, number, EVERY * i) for i in range(len(states))]
-                    scenes.append((episode.attributes["model_file"], states))
+                    scenes.append((str(episode.attributes["model_file"]), states))
     if not scenes:
         return Films(note="the demonstrations contain no simulator states.")
     pictures = _render(scenes) if report is None else render_states(scenes, report=report)
@@ -169,10 +169,9 @@ def explore_demonstrations(
                     raise DataError(
                         path, f"data/{names[number]}", f"contains no step {steps.max()}"
                     )
-                recorded, attributes = episode.extras, episode.attributes
-                if "phases" in recorded and "phase_names" in attributes:
-                    phase_names = np.array(list(attributes["phase_names"]), dtype=object)
-                    phase[rows] = phase_names[recorded["phases"][steps]]
+                recorded = episode.extras
+                if named_phases := phase_names(path, f"data/{names[number]}", episode):
+                    phase[rows] = np.array(named_phases, dtype=object)[recorded["phases"][steps]]
                 if "successes" in recorded:
                     success[rows] = recorded["successes"][steps] != 0
     columns = (embeddings.task, embeddings.episode, embeddings.step)
