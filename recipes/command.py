@@ -24,6 +24,7 @@ with needs("recipes"):
     from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_bmrl.errors import ConfigError
+from torchrl_bmrl.files import printable
 from torchrl_bmrl.pipeline import Run, Settings
 from torchrl_bmrl.run.command_line import exit_codes
 from torchrl_bmrl.run.folder import deciding, flat, other_setting, read_settings
@@ -94,7 +95,7 @@ def run_recipe(
             log.debug("%s: %s, %s", run.folder, function.__name__, settings.preset)
             result = function(run, *arguments)
             if isinstance(result, str):
-                print(result)
+                print(printable(result, lines=True))
 
 
 def with_folders_settings(config: DictConfig, section: str | None = None) -> DictConfig:

@@ -93,7 +93,7 @@ def test_markdown_html_and_csv_hold_the_same_cells() -> None:
         "| A\\|B | N |",
         "| :--- | ---: |",
         "| x\\|y | 1.5 |",
-        "| <b> | [2, 3] |",
+        "| &lt;b> | [2, 3] |",
     ]
     assert list(csv.reader(io.StringIO(table.csv()))) == [["A|B", "N"], *map(list, table.rows)]
     html = table.html()

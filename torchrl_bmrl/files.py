@@ -8,6 +8,7 @@ import io
 import json
 import math
 import os
+import re
 import shutil
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -213,6 +214,51 @@ def read_json(path: str | os.PathLike[str], what: str) -> Any:
         raise DataError(Path(path), None, f"not {what} ({error})") from error
 
 
+def printable(text: str, *, lines: bool = False) -> str:
+    r"""Returns a text that a terminal shows and does not obey: without control characters.
+
+    Args:
+        text: From a file, perhaps.
+        lines: Whether it may have several lines.
+
+    Example:
+        >>> printable("lift\x1b[2J\n")
+        'lift\\x1b[2J\\n'
+    """
+    kept = "\n" if lines else ""
+    return "".join(
+        c if c.isprintable() or c in kept else c.encode("unicode_escape").decode() for c in text
+    )
+
+
+_ONE = r"[-+]?(\d[\d,]*\.?\d*(e[-+]?\d+)?%?|inf|nan)"
+_NUMBER = re.compile(rf"{_ONE}( \[{_ONE}, {_ONE}\])?")
+_FORMULA = re.compile(r"'*[=+\-@\t\r]")
+
+
+def to_cell(value: Any) -> Any:
+    """Returns a value for a CSV file that no spreadsheet takes for a formula.
+
+    A text that begins with =, +, -, @, a tab or a carriage return gets an apostrophe before it, and
+    so does one that would look like that. Numbers stay numbers, and so do their intervals.
+
+    Args:
+        value: A text or a number; :func:`from_cell` returns the same text.
+
+    Example:
+        >>> to_cell("=1+1"), to_cell("-0.5"), to_cell(-0.5), from_cell(to_cell("'=1"))
+        ("'=1+1", '-0.5', -0.5, "'=1")
+    """
+    if not isinstance(value, str) or _NUMBER.fullmatch(value) or not _FORMULA.match(value):
+        return value
+    return f"'{value}"
+
+
+def from_cell(text: str) -> str:
+    """Returns the text that :func:`to_cell` was given."""
+    return text[1:] if text.startswith("'") and _FORMULA.match(text) else text
+
+
 def write_rows(path: str | os.PathLike[str], rows: Sequence[Mapping[str, Any]]) -> None:
     """Writes a whole CSV file, or leaves the old one.
 
@@ -223,7 +269,7 @@ def write_rows(path: str | os.PathLike[str], rows: Sequence[Mapping[str, Any]]) 
     buffer = io.StringIO()
     writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows([{key: to_cell(x) for key, x in row.items()} for row in rows])
     write_atomic(path, buffer.getvalue())
 
 
@@ -266,7 +312,7 @@ def read_rows(
                 if column not in (reader.fieldnames or ()):
                     message = f"column is missing; expected the columns {', '.join(columns)}"
                     raise DataError(path, column, message)
-            rows = [parse_row(record, columns, path, reader.line_num) for record in reader]
+            rows = [parse_row(_texts(record), columns, path, reader.line_num) for record in reader]
     except (csv.Error, UnicodeDecodeError) as error:
         raise DataError(path, None, f"not a CSV file ({error})") from error
     for column in columns:
@@ -278,6 +324,10 @@ def read_rows(
     if expected is not None:
         check_rows(path, rows, expected)
     return rows
+
+
+def _texts(record: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: from_cell(x) if isinstance(x, str) else x for key, x in record.items()}
 
 
 def check_rows(

@@ -22,6 +22,7 @@ from torchrl_bmrl.data.options import LastStep, ReadOptions, Reward
 from torchrl_bmrl.data.robosuite import Relabelling
 from torchrl_bmrl.data.sources import Source, open_source
 from torchrl_bmrl.data.summary import Summary, summarise
+from torchrl_bmrl.files import printable
 from torchrl_bmrl.run.command_line import exit_codes
 from torchrl_bmrl.run.progress import progress
 
@@ -106,13 +107,13 @@ def check(options: argparse.Namespace) -> int:
             )
         summary.problems = [*source.problems, *summary.problems]
         summary.warnings = [*source.oddities, *summary.warnings]
-        print("\n".join(describe(source, summary)))
+        print("\n".join(map(printable, describe(source, summary))))
     if relabelled:
-        print("\n".join([RELABELLED, *relabelled]))
+        print("\n".join([RELABELLED, *map(printable, relabelled)]))
     for warning in summary.warnings:
-        print(f"warning: {warning}")
+        print(printable(f"warning: {warning}"))
     for key, message in summary.problems:
-        print(f"error: {options.file}: {key}: {message}", file=sys.stderr)
+        print(printable(f"error: {options.file}: {key}: {message}"), file=sys.stderr)
     if summary.problems:
         print(f"wrong: {len(summary.problems)}", file=sys.stderr)
     return 1 if summary.problems else 0
@@ -131,7 +132,7 @@ def convert_command(options: argparse.Namespace) -> int:
         )
     print(f"{options.out}: {options.to}, {done.account.read}")
     for note in done.notes:
-        print(f"warning: {note}")
+        print(printable(f"warning: {note}"))
     return 0
 
 

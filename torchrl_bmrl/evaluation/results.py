@@ -14,7 +14,7 @@ import numpy as np
 
 from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.evaluation.statistics import bootstrap_interval
-from torchrl_bmrl.files import finite, flag, parse_row, read_rows, whole, write_atomic
+from torchrl_bmrl.files import finite, flag, parse_row, read_rows, to_cell, whole, write_atomic
 
 POLICIES: tuple[str, ...] = (
     "expert",
@@ -229,7 +229,7 @@ def write_results(path: str | os.PathLike[str], rows: Iterable[ResultRow]) -> No
             "success": "" if row.success is None else str(int(row.success)),
         }
         result_row(parse_row(record, RESULT_COLUMNS, path, line), path, line)
-        writer.writerow(record)
+        writer.writerow({key: to_cell(text) for key, text in record.items()})
     write_atomic(path, text.getvalue())
 
 

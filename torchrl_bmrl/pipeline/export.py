@@ -17,7 +17,7 @@ from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
 from torchrl_bmrl.pipeline.evaluate import held_out_episode, run_facts
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.student import Student
-from torchrl_bmrl.reports.tables import results_table
+from torchrl_bmrl.reports.tables import markdown_text, results_table
 from torchrl_bmrl.run.folder import read_versions
 from torchrl_bmrl.training.checkpoint import save_checkpoint
 
@@ -104,10 +104,10 @@ def _write_policy(run: Run, student: Student, metadata: dict[str, Any]) -> None:
     )
     clip, bcq, distill = metadata["latent_clip"], settings.bcq, settings.distill
     card = CARD.format(
-        preset=settings.preset,
+        preset=markdown_text(settings.preset),
         seed=settings.seed,
         number=len(metadata["tasks"]),
-        tasks=", ".join(run.titles[name].lower() for name in metadata["tasks"]),
+        tasks=markdown_text(", ".join(run.titles[name].lower() for name in metadata["tasks"])),
         dim=student.prototypes.shape[-1],
         parameters=sum(
             parameter.numel()
@@ -120,14 +120,14 @@ def _write_policy(run: Run, student: Student, metadata: dict[str, Any]) -> None:
         latent=student.latent_dim,
         action=metadata["student"]["action_dim"],
         draw="N(0, I)" if clip is None else f"N(0, I) and clipped to ±{clip:g}",
-        demonstrations=run_facts(run)["Demonstrations"],
+        demonstrations=markdown_text(run_facts(run)["Demonstrations"]),
         bcq_updates=bcq.epochs * bcq.updates_per_epoch,
         bcq_batch=bcq.batch_size,
         bcq_lr=bcq.lr,
         updates=distill.updates,
         batch=distill.batch_size,
         lr=distill.lr,
-        versions=", ".join(f"{name} {version}" for name, version in versions.items()),
+        versions=markdown_text(", ".join(f"{name} {x}" for name, x in versions.items())),
         accuracy=_accuracy(student, metadata["accuracy"]),
         classifier="" if metadata["accuracy"] is None else ", its classifier",
         table=table,

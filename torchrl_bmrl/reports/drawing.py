@@ -22,6 +22,7 @@ with needs("reports"):
     from matplotlib.colors import to_hex, to_rgb
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
+    from matplotlib.text import Text
 
 # Okabe & Ito's palette, which stays distinct under the common colour-vision deficiencies.
 _OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -212,6 +213,10 @@ def tidy(axes: Axes) -> None:
 def png(figure: Figure) -> bytes:
     """Renders a figure as a PNG image."""
     data = io.BytesIO()
+    for text in figure.findobj(Text):
+        # A name may have dollar signs; the labels of logarithmic axes are formulas.
+        if "$" in text.get_text() and "\\mathdefault" not in text.get_text():
+            text.set_parse_math(False)
     # Without this the file names matplotlib's version, and equal pictures differ.
     figure.savefig(data, format="png", dpi=120, metadata={"Software": None})
     return data.getvalue()

@@ -10,6 +10,7 @@ from html import escape
 
 from torchrl_bmrl.evaluation.embedding import GoalDistanceResult, StageResult
 from torchrl_bmrl.evaluation.results import Summary
+from torchrl_bmrl.files import printable, to_cell
 
 MISSING = "–"
 """Cell of a number that is not known."""
@@ -58,13 +59,18 @@ class Table:
         """
         rule = ["---:" if self._is_numeric(column) else ":---" for column in range(self._width)]
         lines = [self.header, rule, *self.rows]
-        cells = ["| " + " | ".join(c.replace("|", "\\|") for c in line) + " |" for line in lines]
-        return "\n".join([f"{'#' * level} {self.title}", "", self.caption, "", *cells, ""])
+        cells = [
+            "| " + " | ".join(markdown_text(c).replace("|", "\\|") for c in line) + " |"
+            for line in lines
+        ]
+        title, caption = markdown_text(self.title), markdown_text(self.caption)
+        return "\n".join([f"{'#' * level} {title}", "", caption, "", *cells, ""])
 
     def csv(self) -> str:
         """Returns header and rows as CSV, without title and caption."""
         text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([self.header, *self.rows])
+        lines = [[to_cell(cell) for cell in line] for line in (self.header, *self.rows)]
+        csv.writer(text, lineterminator="\n").writerows(lines)
         return text.getvalue()
 
     def html(self) -> str:
@@ -90,6 +96,19 @@ class Table:
     def _is_numeric(self, column: int) -> bool:
         cells = [row[column] for row in self.rows]
         return any(map(_has_digit, cells)) and not any(any(map(str.isalpha, c)) for c in cells)
+
+
+def markdown_text(text: str) -> str:
+    """Returns a text that Markdown shows in one line, without elements of HTML, links and pictures.
+
+    Args:
+        text: From a file, perhaps.
+
+    Example:
+        >>> markdown_text("<b>a</b> [b](c)")
+        '&lt;b>a&lt;/b> [b]&#40;c)'
+    """
+    return printable(text).replace("<", "&lt;").replace("](", "]&#40;")
 
 
 def task_name(task: str) -> str:

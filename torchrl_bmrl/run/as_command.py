@@ -9,13 +9,14 @@ import sys
 from types import TracebackType
 
 from torchrl_bmrl.errors import BMRLError
+from torchrl_bmrl.files import printable
 
 
 def _print_error(
     kind: type[BaseException], error: BaseException, trace: TracebackType | None
 ) -> None:
     if isinstance(error, BMRLError):
-        print(f"error: {error}", file=sys.stderr, flush=True)
+        print(f"error: {printable(str(error))}", file=sys.stderr, flush=True)
     elif isinstance(error, KeyboardInterrupt):  # Python then ends as SIGINT does
         print("interrupted", file=sys.stderr, flush=True)
     else:

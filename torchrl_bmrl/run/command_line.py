@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import torch
 
 from torchrl_bmrl.errors import BMRLError, StoppedError
+from torchrl_bmrl.files import printable
 from torchrl_bmrl.run.logs import write_line
 from torchrl_bmrl.run.stops import check_stop, stop_on_signals
 
@@ -52,7 +53,7 @@ def exit_codes(*, out_of_memory: str = "", saves: bool = True) -> Iterator[None]
         number = signal.SIGINT if saves or not interrupt.args else interrupt.args[0]
         raise SystemExit(128 + number) from interrupt
     except BMRLError as error:
-        write_line(f"error: {error}")
+        write_line(f"error: {printable(str(error))}")
         raise SystemExit(1) from error
     except torch.OutOfMemoryError as error:
         reason = str(error).strip().partition("\n")[0]

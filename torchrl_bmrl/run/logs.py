@@ -10,6 +10,8 @@ import contextlib
 import logging
 import sys
 
+from torchrl_bmrl.files import printable
+
 LOGGER = logging.getLogger("torchrl_bmrl")
 """Parent of every logger of this library."""
 
@@ -25,6 +27,7 @@ def write_line(message: str) -> None:
     Example:
         >>> write_line("update 2000 saved")
     """
+    message = printable(message, lines=True)
     bars = sys.modules.get("tqdm")  # not imported: no progress bar exists
     with contextlib.suppress(OSError):
         if bars is None:
