@@ -23,9 +23,11 @@ from small_runs import study_run
 
 from torchrl_bmrl.data.source_files import files_of
 from torchrl_bmrl.errors import BMRLError, CheckpointError, ConfigError, DataError
+from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
 from torchrl_bmrl.files import write_atomic
-from torchrl_bmrl.pipeline import Run, collect, stage1, stage2
-from torchrl_bmrl.run.folder import INPUTS, check_files, open_run
+from torchrl_bmrl.pipeline import Run, collect, held_out, stage1, stage2
+from torchrl_bmrl.pipeline.evaluate import evaluate_once
+from torchrl_bmrl.run.folder import INPUTS, check_files, check_made_from, open_run
 from torchrl_bmrl.studies import people
 from torchrl_bmrl.studies.people import HumanSettings, learn_from_people
 
@@ -178,6 +180,57 @@ def test_the_files_of_a_data_set_are_those_that_are_read(tmp_path: Path) -> None
     assert [path.name for path in files_of(tmp_path / "set")] == ["0.parquet", "info.json"]
     assert files_of(tmp_path) == [tmp_path / "demo.hdf5"]  # a folder of HDF5 files
     assert files_of(tmp_path / "nowhere") == []
+
+
+# -- results and the policies that they are of ---------------------------------------------------
+
+
+def test_a_result_of_another_policy_is_refused_until_it_is_removed(trained: Run) -> None:
+    played: list[int] = []
+
+    def play(seeds: list[int]) -> list[EpisodeOutcome]:
+        played.append(len(seeds))
+        return [EpisodeOutcome(1.0, None) for _ in seeds]
+
+    def evaluated() -> None:
+        path = trained.agent_path("door")
+        evaluate_once(trained, "door", "bcq", play, of=[path], report=lambda steps: None)
+
+    evaluated()
+    evaluated()
+    assert played == [1]
+    shutil.copy(trained.agent_path("drawer"), trained.agent_path("door"))
+    with pytest.raises(ConfigError, match=r"door-bcq.csv: made from another .*remove this result"):
+        evaluated()
+    (trained.folder / "evaluation" / "door-bcq.csv").unlink()
+    evaluated()
+    evaluated()
+    assert played == [1, 1]
+
+
+def test_numbers_of_a_student_that_was_trained_further_are_refused(
+    trained: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = dict.fromkeys(held_out.COLUMNS, 0.5) | {"task": "door"}
+    monkeypatch.setattr(held_out, "_held_out", lambda run, name, report: row)
+    half = trained.student_path.with_name("checkpoint.1.safetensors").read_bytes()
+    whole = trained.student_path.read_bytes()
+    trained.student_path.write_bytes(half)
+    held_out.held_out_job((trained, "door"), lambda updates: None)
+    trained.student_path.write_bytes(whole)
+    with pytest.raises(ConfigError, match=r"door-held_out.csv: made from another"):
+        held_out.held_out_job((trained, "door"), lambda updates: None)
+
+
+def test_a_result_of_an_earlier_version_is_taken_as_it_is(tmp_path: Path) -> None:
+    result, policy = tmp_path / "lift-bcq.csv", tmp_path / "policy"
+    result.write_text("its episodes")
+    check_made_from(result, [policy])  # a policy that is gone
+    policy.write_text("first")
+    check_made_from(result, [policy])
+    policy.write_text("second")
+    with pytest.raises(ConfigError, match=r"made from another"):
+        check_made_from(result, [policy])
 
 
 # -- demonstrations and their statistics -----------------------------------------------------------

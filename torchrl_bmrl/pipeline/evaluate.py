@@ -155,6 +155,7 @@ def evaluate_once(
     policy: str,
     play: Callable[[list[int]], list[EpisodeOutcome]],
     *,
+    of: Sequence[Path] = (),
     source: str = "",
     development: bool = False,
     report: Report,
@@ -168,6 +169,7 @@ def evaluate_once(
         task: name of the task.
         policy: name of the policy in tables.
         play: plays one episode for each of the given seeds.
+        of: the policy's checkpoint.
         source: source of m, for the distilled policy.
         development: whether to start from other seeds than the evaluation's, for tuning.
         report: called with the number of steps if the episodes are loaded.
@@ -205,6 +207,7 @@ def evaluate_once(
         read,
         make,
         skipped=lambda: report(episodes * run.horizon(run.task(task))),
+        of=of,
     )
 
 
@@ -228,7 +231,8 @@ def evaluate_job(job: tuple[Run, tuple[str, str, str]], report: Report) -> list[
         statistics = ObservationStatistics.from_lists(metadata["statistics"])
         return run.play(task, policy, transform, seeds=seeds, statistics=statistics, report=report)
 
-    return evaluate_once(run, name, policy_name, play, source=source, report=report)
+    of = {"bcq": [run.agent_path(name)], "distilled": [run.student_path]}.get(policy_name, [])
+    return evaluate_once(run, name, policy_name, play, of=of, source=source, report=report)
 
 
 def source_of_m(

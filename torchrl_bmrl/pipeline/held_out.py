@@ -97,6 +97,7 @@ def held_out_job(job: tuple[Run, str], report: Report) -> dict[str, str | float]
         partial(read_rows, columns=COLUMNS, expected=[{"task": name}]),
         lambda path: write_rows(path, [_held_out(run, name, report)]),
         skipped=lambda: report(2 * _critic_updates(run)),
+        of=[run.agent_path(name), run.student_path],
     )
     return row
 

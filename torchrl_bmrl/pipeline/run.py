@@ -42,7 +42,7 @@ from torchrl_bmrl.pipeline.task_files import (
     train_episodes,
     with_run_options,
 )
-from torchrl_bmrl.run.folder import check_files
+from torchrl_bmrl.run.folder import check_files, check_made_from
 from torchrl_bmrl.run.locks import lock_run
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
 from torchrl_bmrl.tasks import Task, compose_tasks, import_module_of
@@ -153,6 +153,9 @@ class Run:
     def task(self, name: str) -> Task:
         """Returns a task of the run.
 
+        Args:
+            name: name of the task.
+
         Raises:
             UnknownNameError: for a name that is not a task of the run.
         """
@@ -193,11 +196,7 @@ class Run:
         return self.folder / "data"
 
     def check_files(self) -> None:
-        """Checks that the files that the settings name have the content that the run knows.
-
-        Raises:
-            ConfigError: naming the first one with another content.
-        """
+        """Refuses files that the settings name if they have another content than before."""
         check_files(self.folder, input_files(self.settings, self.tasks))
 
     @property
@@ -208,7 +207,11 @@ class Run:
         return self.folder / "distill" / "checkpoint.safetensors"
 
     def demonstrations(self, name: str) -> Path:
-        """Returns the file with a task's demonstrations."""
+        """Returns the file with a task's demonstrations.
+
+        Args:
+            name: name of the task.
+        """
         return demonstration_path(self.data_dir, name)
 
     def agent_path(self, name: str) -> Path:
@@ -231,8 +234,7 @@ class Run:
             name: name of the task.
             split: ``"train"``, ``"valid"`` or ``"context"``.
         """
-        index = self.names.index(name)
-        task = self.tasks[index]
+        index, task = self.names.index(name), self.task(name)
         data = load_transitions(self.data_dir, task, self.statistics, split=split, index=index)
         check_demonstrations(self.data_dir, [task])  # of what was read
         return data
@@ -246,7 +248,7 @@ class Run:
         """Returns a trained agent, frozen.
 
         Args:
-            name: name of the agent; a task's first agent has the task's name.
+            name: name of the agent.
             path: its checkpoint; by default that of stage 1.
 
         Raises:
@@ -258,11 +260,7 @@ class Run:
         return loss
 
     def student(self) -> tuple[Student, dict[str, Any]]:
-        """Returns the distilled student and its checkpoint's metadata.
-
-        Raises:
-            CheckpointError: also if its observations were normalised with other statistics.
-        """
+        """Returns the distilled student and its metadata; refused as :meth:`teacher`."""
         student, metadata = self.policy()
         check_statistics(self.student_path, metadata, self.statistics)
         return student, metadata
@@ -281,6 +279,7 @@ class Run:
         make: Callable[[Path], Any],
         *,
         skipped: Callable[[], Any] = lambda: None,
+        of: Sequence[Path] = (),
     ) -> Result:
         """Returns the content of a file, which is written first if it does not exist.
 
@@ -289,8 +288,10 @@ class Run:
             read: reads the file.
             make: writes the file atomically.
             skipped: called if the file exists; reports the work that is not done again.
+            of: policies whose result it is; a file of others is an error (:func:`check_made_from`).
         """
         path = self.folder / file
+        check_made_from(path, of)
         if path.exists():
             log.debug("%s: loaded", path)
             skipped()
@@ -354,8 +355,8 @@ class Run:
 
         Args:
             task: a task of this run, or a composition.
-            *transforms: appended transforms.
-            num_envs: number of parallel episodes.
+            *transforms: appended.
+            num_envs: of parallel episodes.
         """
         return make_env(task, self.statistics, *transforms, num_envs=num_envs)
 

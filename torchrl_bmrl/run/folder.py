@@ -168,6 +168,45 @@ def check_files(run_dir: Path, files: Files) -> dict[str, str]:
     return now
 
 
+def check_made_from(result: Path, files: Sequence[Path]) -> None:
+    """Compares the files that a result is made from with those of its record, or writes the record.
+
+    The record is ``<result>.sha256``. Files that are missing are not compared.
+
+    Args:
+        result: the file with the result, which may not exist yet.
+        files: such as the checkpoint of the policy that is evaluated.
+
+    Raises:
+        ConfigError: if the result was made from other files.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> result, policy = folder / "lift-bcq.csv", folder / "policy"
+        >>> write_atomic(policy, "first")
+        >>> check_made_from(result, [policy])
+        >>> write_atomic(result, "its episodes")
+        >>> write_atomic(policy, "second")
+        >>> check_made_from(result, [policy])
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.ConfigError: ...lift-bcq.csv: made from another .../policy; remove ...
+    """
+    record = result.with_name(f"{result.name}.sha256")
+    if not files or not all(file.is_file() for file in files):
+        return
+    digest = digest_of(*files)
+    if not result.exists() or not record.exists():
+        write_atomic(record, digest + "\n")
+    elif record.read_text(encoding="utf-8", errors="replace").strip() != digest:
+        names = " or ".join(map(str, files))
+        raise ConfigError(
+            f"{result}: made from another {names}; remove this result to make it anew, or use "
+            "another run_dir"
+        )
+
+
 def _inputs(run_dir: Path) -> dict[str, Any]:
     """Digests of a folder's files by setting; those of earlier versions have none."""
     path = run_dir / INPUTS

@@ -375,13 +375,13 @@ def evaluate_job(
 ) -> list[ResultRow]:
     """The episodes of a trained algorithm, or of stage 1's ``bcq``, on one task."""
     run, (algorithm, name, coefficients, development) = job
+    task = ALL_TASKS if algorithm == ONE_HOT else name
 
     def play(seeds: list[int]) -> list[EpisodeOutcome]:
         transforms = []
         if algorithm == "bcq":
             policy: TensorDictModuleBase = make_policy(run.teacher(name), run.settings)
         else:
-            task = ALL_TASKS if algorithm == ONE_HOT else name
             learner = Learner(run, algorithm, task, coefficients)
             learner.load()
             policy = learner.make_policy().to("cpu")
@@ -390,4 +390,6 @@ def evaluate_job(
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             return run.play(run.task(name), policy, *transforms, seeds=seeds, report=report)
 
-    return evaluate_once(run, name, algorithm, play, development=development, report=report)
+    own = checkpoint_path(run.folder, algorithm, task)
+    of = [run.agent_path(name) if algorithm == "bcq" else own]
+    return evaluate_once(run, name, algorithm, play, of=of, development=development, report=report)

@@ -35,6 +35,7 @@ from torchrl_bmrl.studies.families_methods import (
     OWN,
     FamilySettings,
     check_files,
+    checkpoints_of,
     context,
     has_demonstrations,
     load_learner,
@@ -257,6 +258,7 @@ def play_member(job: tuple[Run, Job], report: Report) -> list[dict[str, Any]]:
             partial(read_rows, columns=_COLUMNS, expected=episodes),
             partial(_play, run, settings, task, method, episodes, returns, report),
             skipped=partial(report, steps),
+            of=checkpoints_of(run, settings, method),
         )
     return rows
 

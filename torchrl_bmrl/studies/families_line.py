@@ -24,7 +24,7 @@ from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.student import load_student
 from torchrl_bmrl.reports import Table
 from torchrl_bmrl.run.workers import Report
-from torchrl_bmrl.studies.families_methods import FamilySettings
+from torchrl_bmrl.studies.families_methods import OWN, FamilySettings, learner_path
 
 LINES = {"m": "m", "one_hot": "one-hot code"}
 """What is mixed, and its title."""
@@ -52,6 +52,7 @@ def play_line(
 ) -> list[dict[str, Any]]:
     """Episodes along one line, played once: ``share`` of the way, and what was measured."""
     run, (settings, code, (start, end)) = job
+    path_of = learner_path(run, settings, OWN if code == "m" else code)
 
     shares = torch.linspace(0, 1, POINTS).repeat_interleave(settings.episodes)
     places = [
@@ -60,9 +61,7 @@ def play_line(
     ]
 
     def play(path: Path) -> None:
-        path_of = {"m": run.student_path}
-        other = run.folder / settings.folder / code / "checkpoint.safetensors"
-        student, metadata = load_student(path_of.get(code, other))
+        student, metadata = load_student(path_of)
         policy = student.policy(
             num_candidates=run.settings.evaluate.num_candidates,
             latent_clip=metadata["latent_clip"],
@@ -98,6 +97,7 @@ def play_line(
         partial(read_rows, columns=COLUMNS, expected=places),
         play,
         skipped=lambda: report(POINTS * settings.episodes * run.horizon(run.task(start))),
+        of=[path_of],
     )
 
 

@@ -106,6 +106,18 @@ class Learner:
     infers: TensorDictModule
 
 
+def learner_path(run: Run, settings: FamilySettings, name: str) -> Path:
+    """Checkpoint of a policy that was trained: :data:`OWN`, or a folder of the study."""
+    if name == OWN:
+        return run.student_path
+    return run.folder / settings.folder / name / "checkpoint.safetensors"
+
+
+def checkpoints_of(run: Run, settings: FamilySettings, method: str) -> list[Path]:
+    """Checkpoints of the policy of a method, as far as the method names one."""
+    return [learner_path(run, settings, _WAYS[method][0])] if method in _WAYS else []
+
+
 def load_learner(run: Run, settings: FamilySettings, name: str) -> Learner:
     """A policy that was trained.
 
@@ -117,7 +129,7 @@ def load_learner(run: Run, settings: FamilySettings, name: str) -> Learner:
     Raises:
         CheckpointError: if it is missing or damaged.
     """
-    path = run.folder / settings.folder / name / "checkpoint.safetensors"
+    path = learner_path(run, settings, name)
     if name == "focal":
         focal = load_focal(path)
         return Learner(focal.policy(), focal.prototypes, focal.encoder, focal.encoder)

@@ -156,6 +156,7 @@ def evaluate_job(job: tuple[Run, tuple[str, int, FQESettings]], report: Report) 
         partial(read_rows, columns=COLUMNS, expected=[{"task": name, "updates": updates}]),
         lambda path: write_rows(path, [_evaluate(run, name, updates, settings, report)]),
         skipped=lambda: report(_units(run, name, settings)),
+        of=[_checkpoint(run, name, updates)],
     )
     return row
 

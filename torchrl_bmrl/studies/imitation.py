@@ -171,6 +171,7 @@ def play_job(job: tuple[Run, Job], report: Report) -> list[dict[str, Any]]:
         partial(read_rows, columns=_COLUMNS, expected=episodes),
         play,
         skipped=lambda: report(count * run.horizon(task)),
+        of=[] if method in ("cloning", "replay") else [run.student_path],
     )
 
 

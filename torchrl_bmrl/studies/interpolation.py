@@ -40,7 +40,7 @@ from torchrl_bmrl.files import (
 from torchrl_bmrl.modules import BCQPolicy, PathTaskLatent
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.reports import Section, write_study
-from torchrl_bmrl.run.folder import open_run
+from torchrl_bmrl.run.folder import check_made_from, open_run
 from torchrl_bmrl.run.settings import setting
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.studies.interpolation_report import (
@@ -275,6 +275,7 @@ def play_job(
     """The episodes of a method and of the noise that it is compared with, played once."""
     run, (settings, name) = job
     paths = {part: run.folder / settings.folder / f"{part}.csv" for part in _parts(name)}
+    check_made_from(paths[name], [run.student_path])
     if all(path.exists() for path in paths.values()):
         report(_num_steps(run, settings, name))
         return {part: read_episodes(path, run.names) for part, path in paths.items()}

@@ -30,7 +30,7 @@ from torchrl_bmrl.modules import HeldTaskLatent, task_latent_box
 from torchrl_bmrl.modules.generator import Network, make_mlp
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.reports import Picture, Section, Table, success_curves, write_study
-from torchrl_bmrl.run.folder import open_run
+from torchrl_bmrl.run.folder import check_made_from, open_run
 from torchrl_bmrl.run.settings import setting
 from torchrl_bmrl.run.workers import Report, derive_seed
 from torchrl_bmrl.training.health import check_metrics
@@ -130,6 +130,7 @@ def train_job(job: tuple[Run, tuple[LatentSACSettings, str, int]], report: Repor
     """Trains the agent of a variant and a seed, or reads it back; one row per evaluation."""
     run, (settings, variant, seed) = job
     path = run.folder / settings.folder / f"{variant}-seed{seed}.csv"
+    check_made_from(path, [run.student_path] if variant == "latent" else [])
     if path.exists():
         rows = read_rows(path, COLUMNS)
         check_rows(path, rows, [{"variant": variant, "seed": seed}] * max(1, len(rows)))

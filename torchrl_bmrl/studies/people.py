@@ -166,6 +166,7 @@ def evaluate_job(job: Job, report: Report) -> list[dict[str, Any]]:
     """Episodes of one agent."""
     run, (share, seed) = job
     (task,), policy = run.tasks, f"human{share:g}-{seed}"
+    path = run.agent_path(f"{task.name}-{policy}")
 
     def play(seeds: list[int]) -> list[EpisodeOutcome]:
         count = run.settings.evaluate.num_candidates
@@ -180,7 +181,7 @@ def evaluate_job(job: Job, report: Report) -> list[dict[str, Any]]:
             "success": "" if row.success is None else int(row.success),
             "return": row.episode_return,
         }
-        for row in evaluate_once(run, task.name, policy, play, report=report)
+        for row in evaluate_once(run, task.name, policy, play, of=[path], report=report)
     ]
 
 
