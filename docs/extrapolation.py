@@ -47,10 +47,11 @@ from torchrl.objectives import DDPGLoss, LossModule, SoftUpdate, TD3Loss
 
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
-from torchrl_bmrl.files import finite, read_rows, whole, write_atomic, write_rows
+from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.functional import nonzero_scale
 from torchrl_bmrl.modules import ActionVAE, BCQPolicy, PLASPolicy, make_latent_actor
 from torchrl_bmrl.objectives import BCQLoss, PLASLoss
+from torchrl_bmrl.rows import finite, read_rows, whole, write_rows
 from torchrl_bmrl.run.command_line import exit_codes
 from torchrl_bmrl.run.locks import lock_run
 from torchrl_bmrl.run.workers import Report, available_cores, derive_seed, run_jobs

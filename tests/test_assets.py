@@ -113,7 +113,7 @@ def test_a_film_without_its_mesh_says_so(tmp_path: Path, monkeypatch: pytest.Mon
         pytest.importorskip(extra)
     import test_films
 
-    from torchrl_bmrl.pipeline.evaluate import films_of
+    from torchrl_bmrl.pipeline.films import films_of
     from torchrl_bmrl.reports import films
 
     def missing(*_: object, **__: object) -> None:

@@ -13,7 +13,8 @@ import pytest
 
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
-from torchrl_bmrl.files import number, printable, read_rows, write_rows
+from torchrl_bmrl.files import printable
+from torchrl_bmrl.rows import number, read_rows, write_rows
 
 FORMULA = "=1+1"
 TEXTS = [FORMULA, "+a", "-a", "@a", "\ta", "'=a", "''-a", "'a", "a", "", "-1-2", "–"]

@@ -29,10 +29,10 @@ from tiny_family import FAMILY, HORIZON, make_walk
 from torchrl_bmrl.data.robomimic import read_kept_episode
 from torchrl_bmrl.errors import BMRLError, ConfigError
 from torchrl_bmrl.evaluation import read_results
-from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.pipeline import Run, evaluate, stage2, two_stage
 from torchrl_bmrl.pipeline.export import export
 from torchrl_bmrl.pipeline.student import load_student
+from torchrl_bmrl.rows import write_rows
 from torchrl_bmrl.studies import families, families_methods
 from torchrl_bmrl.studies.families import generalise
 from torchrl_bmrl.studies.families_methods import METHODS, OWN, make_method

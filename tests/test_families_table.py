@@ -21,7 +21,7 @@ from small_runs import RECIPES
 
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
 from torchrl_bmrl.evaluation.clusters import clustered_ratio
-from torchrl_bmrl.files import write_rows
+from torchrl_bmrl.rows import write_rows
 from torchrl_bmrl.studies.families import METHODS
 from torchrl_bmrl.studies.families_report import make_tables
 from torchrl_bmrl.studies.families_runs import combine, read_study

@@ -105,7 +105,7 @@ class OneTask(SimpleNamespace):
 def test_without_a_renderer_the_rest_is_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str
 ) -> None:
-    from torchrl_bmrl.pipeline.evaluate import films_of
+    from torchrl_bmrl.pipeline.films import films_of
     from torchrl_bmrl.reports.films import explore_demonstrations
 
     monkeypatch.setenv("MUJOCO_GL", library)
@@ -121,7 +121,7 @@ def test_without_a_renderer_the_rest_is_there(
 def test_films_are_rendered_once_and_read_from_their_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from torchrl_bmrl.pipeline.evaluate import films_of
+    from torchrl_bmrl.pipeline.films import films_of
     from torchrl_bmrl.reports import films
 
     def render(scenes: list[Any], report: Any) -> list[np.ndarray]:
@@ -155,7 +155,8 @@ def test_pictures_of_transitions_that_are_not_shown_are_left_out(tmp_path: Path)
 def test_what_needs_no_student_is_done_beside_stage_2_where_there_are_workers_for_it(
     monkeypatch: pytest.MonkeyPatch, workers: int, encoder: str
 ) -> None:
-    from torchrl_bmrl.pipeline.evaluate import evaluate_job, film_job
+    from torchrl_bmrl.pipeline.evaluate import evaluate_job
+    from torchrl_bmrl.pipeline.films import film_job
     from torchrl_bmrl.pipeline.settings import Settings
 
     # The package has a function of the module's name.

@@ -33,10 +33,11 @@ from torchrl_bmrl.data.sampler import TaskSampler
 from torchrl_bmrl.data.schema import check_fps
 from torchrl_bmrl.data.sources import Source
 from torchrl_bmrl.errors import BMRLError, CheckpointError, ConfigError, DataError
-from torchrl_bmrl.files import check_rows, parse_json, read_rows, whole, write_rows
+from torchrl_bmrl.files import parse_json
 from torchrl_bmrl.pipeline.evaluate import held_out_episode
 from torchrl_bmrl.pipeline.settings import BCQSettings
 from torchrl_bmrl.pipeline.student import Student, load_student
+from torchrl_bmrl.rows import check_rows, read_rows, whole, write_rows
 from torchrl_bmrl.run.folder import read_yaml
 from torchrl_bmrl.run.settings import check_settings
 from torchrl_bmrl.studies.interpolation import POSITIONS, read_episodes

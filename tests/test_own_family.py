@@ -27,8 +27,8 @@ from small_runs import RECIPES, recipe
 from torchrl_bmrl.data.importing import read_scaled_episode
 from torchrl_bmrl.data.robomimic import read_kept_episode
 from torchrl_bmrl.errors import ConfigError, DataError
-from torchrl_bmrl.files import read_rows
 from torchrl_bmrl.pipeline import Run, collect, two_stage
+from torchrl_bmrl.rows import read_rows
 from torchrl_bmrl.studies import families
 from torchrl_bmrl.studies.families import generalise
 from torchrl_bmrl.tasks import FAMILIES

@@ -18,8 +18,8 @@ from small_runs import RECIPES, recipe
 
 from torchrl_bmrl.data.importing import read_original_bounds
 from torchrl_bmrl.evaluation import read_results
-from torchrl_bmrl.files import read_rows
 from torchrl_bmrl.pipeline.held_out import COLUMNS
+from torchrl_bmrl.rows import read_rows
 
 PAGE = RECIPES.parent / "docs" / "tasks.md"
 FILES = shown_files(PAGE)

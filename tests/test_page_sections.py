@@ -15,8 +15,8 @@ for extra in ("scipy", "matplotlib", "jinja2", "sklearn"):
 
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.evaluation import ResultRow, write_results
-from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.reports import Section, Table, figures, write_report, write_study
+from torchrl_bmrl.rows import write_rows
 from torchrl_bmrl.training.diagnostics import Diagnostics, write_diagnostics
 
 TITLES = {"pour": "Pouring water", "lift": "Lifting"}

@@ -30,7 +30,7 @@ from published import TASKS, read_published
 
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
 from torchrl_bmrl.evaluation import ResultRow, write_results
-from torchrl_bmrl.files import write_rows
+from torchrl_bmrl.rows import write_rows
 from torchrl_bmrl.training.checkpoint import save_checkpoint
 from torchrl_bmrl.training.diagnostics import Diagnostics, write_diagnostics
 

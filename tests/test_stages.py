@@ -29,7 +29,6 @@ from torchrl_bmrl.data.importing import read_original_bounds
 from torchrl_bmrl.data.robomimic import write_episodes
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
-from torchrl_bmrl.files import read_rows
 from torchrl_bmrl.modules import BCQPolicy, prototype
 from torchrl_bmrl.pipeline import (
     Run,
@@ -43,6 +42,7 @@ from torchrl_bmrl.pipeline.held_out import COLUMNS, evaluate_held_out
 from torchrl_bmrl.pipeline.learners import Agents
 from torchrl_bmrl.pipeline.stage2 import advantage_scale, train_student, value_statistics
 from torchrl_bmrl.pipeline.training_data import training_data
+from torchrl_bmrl.rows import read_rows
 from torchrl_bmrl.tasks import Task, register_task
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 

@@ -159,42 +159,6 @@ def test_a_worker_that_hangs_is_named_and_killed_and_its_job_done_again(
     assert "a worker reported nothing for 20 s and was killed in job 1 of 2; the job is" in said
 
 
-class Pauses:
-    """The module ``time`` for a process that sleeps for hours in each wait for its workers."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.slept = 0.0
-        monkeypatch.setattr(workers, "time", self)
-        wait = workers.wait
-        monkeypatch.setattr(workers, "wait", lambda *args, **kw: self.sleep() or wait(*args, **kw))
-
-    def sleep(self) -> None:
-        self.slept += 10 * workers.SILENCE
-
-    def monotonic(self) -> float:
-        return time.monotonic() + self.slept
-
-
-def report_slowly(job: tuple[str, Path], report: Report) -> str:
-    """Three reports; the first try leaves its name behind."""
-    name, folder = job
-    (folder / name).open("x").close()
-    for _ in range(3):
-        time.sleep(0.1)
-        report(1)
-    return name
-
-
-@pytest.mark.slow
-def test_silence_while_this_process_was_suspended_kills_no_worker(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    Pauses(monkeypatch)
-    jobs = [(name, tmp_path) for name in "abc"]
-    assert run_jobs(report_slowly, jobs, workers=2, **OPTIONS) == ["a", "b", "c"]
-    assert not caplog.messages
-
-
 def work_until_stopped(job: tuple[str, Path], report: Report) -> None:
     """Keeps what it did when it is stopped; ``fails`` fails when all others are at work."""
     name, folder = job
@@ -254,74 +218,6 @@ def test_asked_to_stop_every_job_keeps_what_it_did(
     thread.join()
     for name in names:
         assert int((tmp_path / name).read_text()) >= 1
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("signals_not_ignored")
-def test_suspended_while_it_stops_a_run_keeps_what_its_jobs_did(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    Pauses(monkeypatch)
-    with stop_on_signals():
-        thread = signal_when_all_work(tmp_path, "ab", signal.SIGTERM, group=True)
-        with pytest.raises(StoppedError):
-            run_jobs(work_until_stopped, [(x, tmp_path) for x in "ab"], workers=2, **OPTIONS)
-    thread.join()
-    assert all(int((tmp_path / name).read_text()) >= 1 for name in "ab")
-
-
-def report_often(job: tuple[str, Path], report: Report) -> None:
-    """More reports than a connection holds."""
-    name, folder = job
-    try:
-        while True:
-            report(1)
-    except StoppedError:
-        (folder / name).touch()
-        raise
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("signals_not_ignored")
-def test_asked_to_stop_jobs_save_also_if_nobody_has_read_their_last_reports(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(workers, "GRACE", 10.0)
-    seen: list[int] = []
-
-    def update(bar: Any, units: int) -> None:
-        seen.append(units)
-        if len(seen) == 1000:
-            time.sleep(0.5)  # the connections fill up
-            signal.raise_signal(signal.SIGTERM)
-
-    monkeypatch.setattr(workers, "progress", type("Bar", (Lines,), {"update": update}))
-    with stop_on_signals(), pytest.raises(StoppedError):
-        run_jobs(report_often, [(x, tmp_path) for x in "ab"], workers=2, **OPTIONS)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("signals_not_ignored")
-def test_stopped_while_workers_start_that_import_for_themselves_no_traceback_is_printed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(workers, "METHOD", "spawn")  # as on macOS
-
-    def interrupt() -> None:
-        while len(children := multiprocessing.active_children()) < 2:
-            time.sleep(0.01)
-        time.sleep(2.0)  # they import
-        for pid in (*(child.pid for child in children), os.getpid()):
-            os.kill(pid or 0, signal.SIGINT)
-
-    with stop_on_signals():
-        thread = threading.Thread(target=interrupt)
-        thread.start()
-        with pytest.raises(StoppedError):
-            run_jobs(report_often, [(x, tmp_path) for x in "ab"], workers=2, **OPTIONS)
-    thread.join()
-    assert "Traceback" not in capfd.readouterr().err
 
 
 @pytest.mark.slow

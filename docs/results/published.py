@@ -21,8 +21,8 @@ from torchrl_bmrl.evaluation.results import (
     policy_order,
     result_row,
 )
-from torchrl_bmrl.files import finite, flag, one_of, read_rows, whole, write_rows
 from torchrl_bmrl.reports.paper import TABLE_1
+from torchrl_bmrl.rows import finite, flag, one_of, read_rows, whole, write_rows
 
 TASKS = tuple(TABLE_1)
 """The paper's six tasks, in the order of its tables."""

@@ -14,7 +14,8 @@ import numpy as np
 
 from torchrl_bmrl.errors import BMRLError, DataError
 from torchrl_bmrl.evaluation.statistics import bootstrap_interval
-from torchrl_bmrl.files import finite, flag, parse_row, read_rows, to_cell, whole, write_atomic
+from torchrl_bmrl.files import write_atomic
+from torchrl_bmrl.rows import finite, flag, parse_row, read_rows, to_cell, whole
 
 POLICIES: tuple[str, ...] = (
     "expert",

@@ -19,26 +19,21 @@ from torchrl.envs.transforms import Transform
 from torchrl_bmrl.data.demonstrations import has_contexts, read_demonstrations, read_phases
 from torchrl_bmrl.data.robomimic_file import MASKS
 from torchrl_bmrl.envs.transforms import ObservationStatistics
-from torchrl_bmrl.errors import BMRLError, CheckpointError, ConfigError, StoppedError
+from torchrl_bmrl.errors import CheckpointError, ConfigError
 from torchrl_bmrl.evaluation import ResultRow, read_results, write_results
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
 from torchrl_bmrl.experts.settings import ExpertSettings
-from torchrl_bmrl.files import check_rows
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
+from torchrl_bmrl.pipeline.films import films_of, shows_embedding
 from torchrl_bmrl.pipeline.held_out import evaluate_held_out
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.stage1 import make_policy
 from torchrl_bmrl.pipeline.student import Student
 from torchrl_bmrl.reports import Embeddings, write_report
 from torchrl_bmrl.reports.drawn import draw_embeddings
-from torchrl_bmrl.reports.films import (
-    Films,
-    explore_demonstrations,
-    film_demonstrations,
-    read_films,
-    write_films,
-)
+from torchrl_bmrl.reports.films import explore_demonstrations
 from torchrl_bmrl.reports.tables import task_titles
+from torchrl_bmrl.rows import check_rows
 from torchrl_bmrl.run.folder import read_versions
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.tasks import Task
@@ -118,35 +113,6 @@ def jobs_without_student(run: Run) -> list[tuple[str, str, str]]:
         run: an open run.
     """
     return [(task, policy, "") for policy in ("expert", "bcq") for task in run.names]
-
-
-def shows_embedding(run: Run) -> bool:
-    """Whether each transition has an embedding of its own, which the report then shows."""
-    return run.settings.distill.task_encoder == "transition"
-
-
-def films_of(run: Run, report: Report | None = None) -> Films:
-    """Films of the held-out demonstrations, ``evaluation/films.json``, which are rendered once.
-
-    Args:
-        run: an open run with demonstrations.
-        report: called with the number of new pictures; ``None`` shows a progress bar.
-    """
-
-    def make(path: Path) -> None:
-        write_films(path, film_demonstrations(run.data_dir, run.names, report=report))
-
-    try:
-        return run.once("evaluation/films.json", read_films, make)
-    except StoppedError:
-        raise
-    except BMRLError as error:  # without a renderer, or a mesh
-        return Films(note=f"{error}.")
-
-
-def film_job(job: tuple[Run, None], report: Report) -> None:
-    """Renders the films, for the evaluation."""
-    films_of(job[0], report)
 
 
 def evaluate_once(

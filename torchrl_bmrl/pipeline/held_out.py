@@ -14,11 +14,11 @@ from tensordict import TensorDictBase
 
 from torchrl_bmrl.data.replay import check_device
 from torchrl_bmrl.evaluation.fitted_q import estimate_return
-from torchrl_bmrl.files import finite, number, read_rows, write_rows
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.training_data import training_data
 from torchrl_bmrl.reports.tables import MISSING, Table
+from torchrl_bmrl.rows import finite, number, read_rows, write_rows
 from torchrl_bmrl.run.workers import Report
 
 log = logging.getLogger(__name__)

@@ -16,13 +16,13 @@ from torchrl.data import ReplayBuffer
 
 from torchrl_bmrl.data import make_multi_task_replay_buffer, make_replay_buffer
 from torchrl_bmrl.errors import BMRLError
-from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.modules import BCQPolicy, ChunkPolicy
 from torchrl_bmrl.objectives import BCQLoss
 from torchrl_bmrl.pipeline.learners import Agents
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.settings import Settings
 from torchrl_bmrl.pipeline.training_data import training_data
+from torchrl_bmrl.rows import write_rows
 from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.training.diagnostics import (

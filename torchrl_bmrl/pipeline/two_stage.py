@@ -10,13 +10,8 @@ from typing import Any
 
 from torchrl_bmrl.files import read_json, write_atomic
 from torchrl_bmrl.pipeline.collect import collect
-from torchrl_bmrl.pipeline.evaluate import (
-    evaluate,
-    evaluate_job,
-    film_job,
-    jobs_without_student,
-    shows_embedding,
-)
+from torchrl_bmrl.pipeline.evaluate import evaluate, evaluate_job, jobs_without_student
+from torchrl_bmrl.pipeline.films import film_job, shows_embedding
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.stage1 import stage1
 from torchrl_bmrl.pipeline.stage2 import stage2

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from torchrl_bmrl.evaluation.results import Summary
-from torchrl_bmrl.files import finite, read_rows, whole
 from torchrl_bmrl.reports.figures import Curve, stage1_curves
 from torchrl_bmrl.reports.page import Picture
 from torchrl_bmrl.reports.tables import MISSING, Table, percent
+from torchrl_bmrl.rows import finite, read_rows, whole
 from torchrl_bmrl.training.diagnostics import (
     ACTIVE,
     COLLAPSED,

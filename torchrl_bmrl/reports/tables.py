@@ -10,7 +10,8 @@ from html import escape
 
 from torchrl_bmrl.evaluation.embedding import GoalDistanceResult, StageResult
 from torchrl_bmrl.evaluation.results import Summary
-from torchrl_bmrl.files import printable, to_cell
+from torchrl_bmrl.files import printable
+from torchrl_bmrl.rows import to_cell
 
 MISSING = "–"
 """Cell of a number that is not known."""

@@ -16,7 +16,6 @@ from typing import Any
 from torchrl_bmrl.data.source_files import files_of
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.families import SPLITS
-from torchrl_bmrl.files import number, or_nothing, read_rows, whole, write_rows
 from torchrl_bmrl.modules import embed_context, reads_context
 from torchrl_bmrl.modules.task_latent import check_reads_transitions
 from torchrl_bmrl.pipeline.run import Run
@@ -26,6 +25,7 @@ from torchrl_bmrl.pipeline.task_files import check_playable, with_run_options
 from torchrl_bmrl.reports import Section, write_study
 from torchrl_bmrl.reports.explorer import StoredExplorer
 from torchrl_bmrl.reports.members import Member, explore_members
+from torchrl_bmrl.rows import number, or_nothing, read_rows, whole, write_rows
 from torchrl_bmrl.run.folder import open_run
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.studies.families_films import film_once, why_no_films

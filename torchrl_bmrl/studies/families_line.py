@@ -18,11 +18,11 @@ from torch import Tensor
 
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
 from torchrl_bmrl.evaluation.statistics import rank_correlation
-from torchrl_bmrl.files import number, read_rows, whole, write_rows
 from torchrl_bmrl.modules import PathTaskLatent
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.student import load_student
 from torchrl_bmrl.reports import Table
+from torchrl_bmrl.rows import number, read_rows, whole, write_rows
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.studies.families_methods import OWN, FamilySettings, learner_path
 

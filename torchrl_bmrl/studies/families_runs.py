@@ -11,9 +11,9 @@ from typing import Any
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
 from torchrl_bmrl.evaluation.results import name
 from torchrl_bmrl.families import SPLITS, registered_families
-from torchrl_bmrl.files import finite, one_of, or_nothing, read_rows, whole
 from torchrl_bmrl.pipeline.settings import Settings
 from torchrl_bmrl.reports import Table
+from torchrl_bmrl.rows import finite, one_of, or_nothing, read_rows, whole
 from torchrl_bmrl.run.folder import deciding, read_settings
 from torchrl_bmrl.run.settings import check_settings
 from torchrl_bmrl.studies.families import METHODS, FamilySettings

@@ -18,7 +18,6 @@ from torchrl_bmrl.data import make_replay_buffer
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation import rank_correlation
 from torchrl_bmrl.evaluation.fitted_q import estimate_return
-from torchrl_bmrl.files import finite, read_rows, whole, write_rows
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.pipeline.learners import Agents
 from torchrl_bmrl.pipeline.run import Run
@@ -27,6 +26,7 @@ from torchrl_bmrl.pipeline.training_data import training_data
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
 from torchrl_bmrl.reports.tables import Table
+from torchrl_bmrl.rows import finite, read_rows, whole, write_rows
 from torchrl_bmrl.run.folder import open_run
 from torchrl_bmrl.run.settings import setting
 from torchrl_bmrl.run.workers import Report

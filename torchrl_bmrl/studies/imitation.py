@@ -26,12 +26,12 @@ from torchrl_bmrl.envs.transforms import transform_data
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation import bootstrap_interval
 from torchrl_bmrl.experts.collect import record_success
-from torchrl_bmrl.files import read_rows, whole, write_rows
 from torchrl_bmrl.modules import DemonstrationTaskLatent, StageTaskLatent
 from torchrl_bmrl.modules.demonstration_latent import ALIGNMENTS
 from torchrl_bmrl.modules.task_latent import check_reads_transitions
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.reports import Section, Table, write_study
+from torchrl_bmrl.rows import read_rows, whole, write_rows
 from torchrl_bmrl.run.folder import open_run
 from torchrl_bmrl.run.progress import progress
 from torchrl_bmrl.run.settings import setting

@@ -27,19 +27,10 @@ from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation.behaviour import matching_noise
 from torchrl_bmrl.evaluation.paths import data_path, straight_path, switched_path
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
-from torchrl_bmrl.files import (
-    check_rows,
-    finite,
-    flag,
-    number,
-    one_of,
-    read_rows,
-    whole,
-    write_rows,
-)
 from torchrl_bmrl.modules import BCQPolicy, PathTaskLatent
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.reports import Section, write_study
+from torchrl_bmrl.rows import check_rows, finite, flag, number, one_of, read_rows, whole, write_rows
 from torchrl_bmrl.run.folder import check_made_from, open_run
 from torchrl_bmrl.run.settings import setting
 from torchrl_bmrl.run.workers import Report

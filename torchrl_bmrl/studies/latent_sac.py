@@ -25,11 +25,11 @@ from torchrl.objectives import SACLoss, SoftUpdate
 from torchrl_bmrl.envs.transforms import StageReward
 from torchrl_bmrl.errors import ConfigError
 from torchrl_bmrl.evaluation.rollout import rollout_episodes
-from torchrl_bmrl.files import check_rows, finite, read_rows, whole, write_rows
 from torchrl_bmrl.modules import HeldTaskLatent, task_latent_box
 from torchrl_bmrl.modules.generator import Network, make_mlp
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.reports import Picture, Section, Table, success_curves, write_study
+from torchrl_bmrl.rows import check_rows, finite, read_rows, whole, write_rows
 from torchrl_bmrl.run.folder import check_made_from, open_run
 from torchrl_bmrl.run.settings import setting
 from torchrl_bmrl.run.workers import Report, derive_seed

@@ -20,7 +20,6 @@ from torchrl_bmrl.errors import ConfigError, UnknownNameError
 from torchrl_bmrl.evaluation import bootstrap_interval
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
 from torchrl_bmrl.families import tasks_of
-from torchrl_bmrl.files import write_rows
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.pipeline.collect import collect
 from torchrl_bmrl.pipeline.evaluate import evaluate_once
@@ -31,6 +30,7 @@ from torchrl_bmrl.pipeline.training_data import training_data
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
 from torchrl_bmrl.reports.tables import MISSING, Table
+from torchrl_bmrl.rows import write_rows
 from torchrl_bmrl.run.locks import lock_run
 from torchrl_bmrl.run.progress import progress
 from torchrl_bmrl.run.settings import setting

@@ -12,10 +12,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_bmrl.files import number, read_rows, whole, write_rows
 from torchrl_bmrl.functional import ensemble_value, gaussian_kl
 from torchrl_bmrl.modules import BCQPolicy
 from torchrl_bmrl.objectives import BCQLoss
+from torchrl_bmrl.rows import number, read_rows, whole, write_rows
 
 ACTIVE = 0.01
 """A latent dimension with a larger mean KL divergence [nats] is active."""
