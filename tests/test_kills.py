@@ -1,7 +1,8 @@
 """Whole runs killed at random moments, and started again.
 
-One of the smallest run; with ``BMRL_KILLS=50`` in the environment fifty of preset smoke, which
-take more than an hour.
+Every second one is not killed but asked to stop, with a signal to all of its processes, as
+schedulers and closed terminals do. One of each with the smallest run; with ``BMRL_KILLS=50`` in the
+environment fifty with preset smoke, which take more than an hour.
 """
 
 from __future__ import annotations
@@ -33,32 +34,58 @@ from torchrl_bmrl.training.checkpoint import load_checkpoint
 
 pytestmark = [pytest.mark.robosuite, pytest.mark.slow, pytest.mark.timeout(0)]
 KILLS = int(os.environ.get("BMRL_KILLS", "0"))
+ASKED = (signal.SIGTERM, signal.SIGHUP)
 EQUAL = (
     "results.csv",
     "tables/*",
     "data/*.hdf5",
     "data/statistics.json",
-    "**/*.safetensors",
+    "**/best.safetensors",
+    "**/checkpoint.safetensors",
     "bcq/*/evaluations.csv",
     "evaluation/*.csv",
     "logs/*/scalars/*",
 )
-"""What a run that was killed has in common with one that was not: all but times."""
+"""What a run that was killed has in common with one that was not: all but times.
+
+The checkpoint before the newest is another one if the run was asked to stop just after it.
+"""
 
 
 def start(folder: Path) -> subprocess.Popen[bytes]:
     settings = [*(["preset=smoke"] if KILLS else SMALL), "workers=2", f"run_dir={folder}"]
     command = [sys.executable, str(RECIPES / "two_stage.py"), *settings]
     with (folder.parent / f"{folder.name}.log").open("ab") as log:
-        return subprocess.Popen(command, stdout=log, stderr=log, cwd=folder.parent)
+        return subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=log, cwd=folder.parent, start_new_session=True
+        )
+
+
+def read_log(folder: Path) -> str:
+    return (folder.parent / f"{folder.name}.log").read_text()
 
 
 def finish(folder: Path) -> float:
     """Runs to the end; how long it took [s]."""
     began = time.monotonic()
-    code = start(folder).wait()
-    assert code == 0, (folder.parent / f"{folder.name}.log").read_text()[-3000:]
+    process = start(folder)
+    process.communicate()
+    assert process.returncode == 0, read_log(folder)[-3000:]
     return time.monotonic() - began
+
+
+def ask_to_stop(process: subprocess.Popen[bytes], folder: Path, number: signal.Signals) -> None:
+    """Signals all processes; the run saves every update that it has logged."""
+    os.killpg(process.pid, number)
+    code = process.wait(300)
+    assert code in (128 + number, -number), read_log(folder)[-3000:]  # -number: before it began
+    assert "Traceback" not in read_log(folder)
+    for rows in folder.glob("logs/*/scalars/*.csv"):
+        stage = rows.parts[-3].replace("bcq_", "bcq/")
+        kind = "bcq" if stage.startswith("bcq/") else "student"
+        last = int(rows.read_text().splitlines()[-1].split(",")[0])
+        metadata = load_checkpoint(folder / stage / "checkpoint.safetensors", kind=kind)[1]
+        assert metadata["updates"] >= last, rows
 
 
 def read_everything(folder: Path) -> dict[str, bytes]:
@@ -87,20 +114,23 @@ def test_killed_at_any_moment_a_run_has_lost_nothing_and_ends_with_the_same_file
     expected = contents(whole, *EQUAL)
     assert len(expected) > 40
     moments, killed = random.Random(0), 0
-    while killed < (KILLS or 1):
+    while killed < (KILLS or 2):
         folder = tmp_path / f"killed-{killed}"
         process, moment, began = start(folder), moments.uniform(0.0, seconds), time.monotonic()
         try:
             process.wait(moment)
         except subprocess.TimeoutExpired:
-            process.send_signal(signal.SIGKILL)
-            process.wait()
+            if killed % 2:
+                ask_to_stop(process, folder, ASKED[killed // 2 % 2])
+            else:
+                process.kill()
+                process.wait()
         else:  # faster than the first one
             seconds = time.monotonic() - began
             shutil.rmtree(folder)
             continue
         killed += 1
-        time.sleep(1.0)  # its workers end with it
+        process.communicate(timeout=300)  # the output ends with the last process of the run
         kept = read_everything(folder)
         print(f"{killed}: {moment:.1f} of {seconds:.1f} s, {len(kept)} files kept", flush=True)
         finish(folder)
