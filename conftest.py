@@ -111,6 +111,8 @@ _NEEDS = {
     ],
     "yaml": ["torchrl_bmrl/run/folder.py"],
 }
+# Its import makes a process ignore signals, as the server of workers does.
+collect_ignore = ["torchrl_bmrl/run/forked_server.py"]
 collect_ignore_glob = sorted(
     {glob for package, globs in _NEEDS.items() if find_spec(package) is None for glob in globs}
 )
@@ -154,7 +156,8 @@ def signals_not_ignored() -> Iterator[None]:
 
     Ignored signals stay ignored in a run, so a test that sends one would wait for ever.
     """
-    defaults = {signal.SIGINT: signal.default_int_handler, signal.SIGHUP: signal.SIG_DFL}
+    defaults = {signal.SIGINT: signal.default_int_handler}
+    defaults |= {number: signal.SIG_DFL for number in (signal.SIGHUP, signal.SIGTERM)}
     before = {number: signal.signal(number, handler) for number, handler in defaults.items()}
     yield
     for number, handler in before.items():
