@@ -213,7 +213,7 @@ def held_out_episode(run: Run, name: str) -> TensorDictBase:
     """Returns the demonstration for the source ``demonstration``; exported policies contain one."""
     if run.settings.evaluate.policy:
         state, _ = load_checkpoint(run.student_path, kind="student")
-        _, metadata = run.student()
+        _, metadata = run.policy()
         try:
             found = TensorDict(state["demonstrations"][name]).auto_batch_size_(1)
             sizes = [found[key].shape[-1] for key in TRANSITION_KEYS]
