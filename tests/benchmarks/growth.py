@@ -148,8 +148,8 @@ def draw(found: Measured, path: Path) -> None:
     """Draws the times over the sizes, with what they should be."""
     from matplotlib.figure import Figure
 
-    columns = 4
-    rows = -(-len(found) // columns)
+    rows = 2
+    columns = -(-len(found) // rows)
     figure = Figure(figsize=(3.2 * columns, 2.8 * rows), layout="constrained")
     for number, (name, points) in enumerate(found.items(), 1):
         axes = figure.add_subplot(rows, columns, number)
