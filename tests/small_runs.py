@@ -137,7 +137,7 @@ def contents(folder: Path, *patterns: str) -> dict[str, bytes]:
         str(path.relative_to(folder)): path.read_bytes()
         for pattern in patterns
         for path in sorted(folder.glob(pattern))
-        if path.is_file()
+        if path.is_file() and ".locks" not in path.parts  # they name processes
     }
 
 

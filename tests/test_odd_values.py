@@ -180,7 +180,7 @@ def test_a_policy_without_its_demonstration_is_refused(tmp_path: Path, held: Any
     def run_of(path: Path) -> Any:
         settings = SimpleNamespace(evaluate=SimpleNamespace(policy=str(path)))
         return SimpleNamespace(
-            settings=settings, student_path=path, student=lambda: load_student(path)
+            settings=settings, student_path=path, policy=lambda: load_student(path)
         )
 
     good = saved(tmp_path / "good.safetensors", {"lift": demonstration()})
