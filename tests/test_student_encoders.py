@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ pytest.importorskip("safetensors")
 pytest.importorskip("h5py")
 
 from torchrl_bmrl.errors import BMRLError, CheckpointError, ConfigError, UnknownNameError
+from torchrl_bmrl.files import write_atomic
 from torchrl_bmrl.modules import (
     BCQPolicy,
     ContextTaskLatent,
@@ -105,6 +107,9 @@ def test_all_of_a_student_goes_through_a_checkpoint(name: str, tmp_path: Path) -
     assert policy(data)["action"].shape == (5, 2)
 
 
+STATISTICS = {"loc": [0.0] * 3, "scale": [1.0] * 3}
+
+
 def write(path: Path, module: Student, name: str, **changes: Any) -> None:
     options = {**OPTIONS, "num_cells": [16], "task_encoder": name}
     options |= {"code_dim": 2} if name == "told" else {}
@@ -115,7 +120,7 @@ def write(path: Path, module: Student, name: str, **changes: Any) -> None:
         "tasks": ["a", "b", "c"],
         "latent_clip": 0.5,
         "accuracy": 0.5,
-        "statistics": {"loc": [0.0] * 3, "scale": [1.0] * 3},
+        "statistics": STATISTICS,
     }
     save_checkpoint(path, {"module": module.state_dict()}, metadata | changes)
 
@@ -382,14 +387,13 @@ def test_studies_that_embed_transitions_refuse_and_leave_nothing(name: str, tmp_
     settings = Settings(run_dir=str(tmp_path), tasks=["reach", "lift", "push_up"], workers=1)
     with Run(settings) as run:
         run.student_path.parent.mkdir()
-        names = list(run.names)
-        write(run.student_path, make_student(name), name, tasks=names)
+        write(run.student_path, make_student(name), name, tasks=list(run.names))
+        write_atomic(run.data_dir / "statistics.json", json.dumps(STATISTICS))
         before = sorted(tmp_path.rglob("*"))
-        composition = {"composition": "reach-lift"}
         for study, options in (
-            (imitate, ImitateSettings(**composition)),
+            (imitate, ImitateSettings(composition="reach-lift")),
             (interpolate, InterpolationSettings(task="lift")),
-            (latent_sac, LatentSACSettings(**composition)),
+            (latent_sac, LatentSACSettings(composition="reach-lift")),
         ):
             with pytest.raises(BMRLError, match="single transitions"):
                 study(run, options)
