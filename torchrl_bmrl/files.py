@@ -155,7 +155,7 @@ def digest_of(*paths: Path) -> str:
         >>> path = Path(tempfile.mkdtemp()) / "a.txt"
         >>> _ = path.write_text("1 2 3")
         >>> digest_of(path)[:8]
-        'ff4fda51'
+        '7c8f5059'
     """
     digests = []
     for path in paths:
