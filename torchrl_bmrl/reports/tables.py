@@ -64,7 +64,8 @@ class Table:
             "| " + " | ".join(markdown_text(c).replace("|", "\\|") for c in line) + " |"
             for line in lines
         ]
-        title, caption = markdown_text(self.title), markdown_text(self.caption)
+        # Captions may have links: they are Markdown of the caller, not text from files.
+        title, caption = markdown_text(self.title), printable(self.caption).replace("<", "&lt;")
         return "\n".join([f"{'#' * level} {title}", "", caption, "", *cells, ""])
 
     def csv(self) -> str:
