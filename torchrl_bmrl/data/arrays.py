@@ -28,6 +28,12 @@ def refuse_pointer(path: Path) -> None:
             raise DataError(path, None, message)
 
 
+def capacity(stored: int) -> int:
+    """Largest number of bytes that decompressing so many bytes can yield."""
+    # gzip compresses zeros to about a thousandth, and nothing to less.
+    return 1100 * stored
+
+
 def check_finite(path: str | Path, key: str, array: np.ndarray, first: int = 0) -> None:
     """Refuses NaN and infinity.
 

@@ -25,7 +25,7 @@ from torchrl.envs.transforms import Transform
 
 from torchrl_bmrl.data.convert import Stream
 from torchrl_bmrl.data.episodes import as_tensordict
-from torchrl_bmrl.data.hdf5 import open_file, update_digest
+from torchrl_bmrl.data.hdf5 import open_file, update_digests
 from torchrl_bmrl.data.options import Bounds, LastStep, ReadOptions, Reward
 from torchrl_bmrl.data.robomimic import count_steps
 from torchrl_bmrl.data.sampler import HandsOutCopies, read_memmap
@@ -78,7 +78,7 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
     ``("next", "terminated")``, ``("next", "truncated")`` and, if the file has ``successes``,
     ``("next", "success")``, each ``(N, 1)``; ``episode`` and ``step`` ``(N,)``. Observations keep
     their dtype; floating-point actions and rewards are float32. An episode's last step is
-    ``truncated`` unless the file states that it is terminated.
+    ``truncated`` unless the file states that it is terminated. ``sha256`` is the hash of the file.
 
     Args:
         dataset_id: the file.
@@ -163,7 +163,7 @@ class RobomimicExperienceReplay(BaseDatasetExperienceReplay):
         if not source.is_file():
             raise DataError(source, None, "no such file")
         with open_file(source) as file:  # one handle: the name may get another file at any time
-            digest = _digest(source, file, options, split_trajs)
+            digest, self.sha256 = _digests(source, file, options, split_trajs)
             self._path = self.root / f"{source.stem}-{digest}"
             read = _read(self._path)
             for _ in range(ATTEMPTS):
@@ -264,11 +264,14 @@ def _set_aside(path: Path) -> None:
     shutil.rmtree(aside, ignore_errors=True)
 
 
-def _digest(source: Path, file: h5py.File, options: Mapping[str, Any], split_trajs: bool) -> str:
-    """Hash of an open file's content and of the options."""
-    digest = hashlib.sha256(json.dumps([LAYOUT_VERSION, dict(options), split_trajs]).encode())
-    update_digest(digest, source, file)
-    return digest.hexdigest()[:16]
+def _digests(
+    source: Path, file: h5py.File, options: Mapping[str, Any], split_trajs: bool
+) -> tuple[str, str]:
+    """Hash of an open file's content with the options, and SHA-256 of the content alone."""
+    both = hashlib.sha256(json.dumps([LAYOUT_VERSION, dict(options), split_trajs]).encode())
+    content = hashlib.sha256()
+    update_digests((both, content), source, file)
+    return both.hexdigest()[:16], content.hexdigest()
 
 
 def _convert(
@@ -291,7 +294,7 @@ def _convert(
                     "oddities": list(data_set.oddities),
                 }
             # The folder's name promises this content.
-            if not target.name.endswith(_digest(source, file, options, split_trajs)):
+            if not target.name.endswith(_digests(source, file, options, split_trajs)[0]):
                 raise DataError(source, None, CHANGED)
             metadata["statistics"] = _statistics(data)
             if split_trajs:

@@ -17,7 +17,6 @@ from torchrl_bmrl.data.datasets import RobomimicExperienceReplay
 from torchrl_bmrl.data.episodes import Episode
 from torchrl_bmrl.data.robomimic import open_episodes
 from torchrl_bmrl.data.robomimic_file import CONTEXT_MASK, read_metadata
-from torchrl_bmrl.data.source_files import CHANGED
 from torchrl_bmrl.data.sources import open_sources
 from torchrl_bmrl.envs.transforms import (
     ObservationStatistics,
@@ -58,7 +57,7 @@ def has_contexts(path: Path) -> bool:
 
 
 def read_demonstrations(
-    path: Path, task: Task, *, split: str | None = None, index: int
+    path: Path, task: Task, *, split: str | None = None, index: int, sha256: str | None = None
 ) -> TensorDictBase:
     """Demonstrations of a task as they were recorded.
 
@@ -67,6 +66,7 @@ def read_demonstrations(
         task: the task.
         split: ``"train"``, ``"valid"`` or ``None`` for all.
         index: class index y of the task.
+        sha256: of the content that the file must have; ``None`` for any.
 
     Returns:
         batch ``[N]`` with the keys of
@@ -75,7 +75,8 @@ def read_demonstrations(
     Raises:
         DataError: naming file and key: for a file that this class refuses, for parts that do not
             make an observation, for missing ``successes`` if the task has a definition of success,
-            and for a recorded task whose episode terminates, since its horizon only truncates.
+            for a recorded task whose episode terminates, since its horizon only truncates, and for
+            other content.
 
     Example:
         >>> import tempfile
@@ -96,7 +97,10 @@ def read_demonstrations(
         >>> read_demonstrations(path, task, split="train", index=1)["task"].tolist()
         [1, 1, 1, 1, 1]
     """
-    data = RobomimicExperienceReplay(path, split=split, observation_keys=task.parts)[:].copy()
+    replay = RobomimicExperienceReplay(path, split=split, observation_keys=task.parts)
+    if sha256 is not None and replay.sha256 != sha256:
+        raise _other_content(path, replay.sha256, sha256)
+    data = replay[:].copy()
     try:
         transform = make_observation_transform(task, parts=observation_parts(task, data))
         transform(data[:1].exclude("next"))
@@ -199,12 +203,9 @@ def write_statistics(data_dir: Path, tasks: Sequence[Task]) -> ObservationStatis
     paths = [demonstration_path(data_dir, task.name) for task in tasks]
     digests = [digest_of(path) for path in paths]
     raw = [
-        read_demonstrations(path, task, split="train", index=index)
-        for index, (path, task) in enumerate(zip(paths, tasks, strict=True))
+        read_demonstrations(path, task, split="train", index=index, sha256=digest)
+        for index, (path, task, digest) in enumerate(zip(paths, tasks, digests, strict=True))
     ]
-    for path, digest in zip(paths, digests, strict=True):
-        if digest_of(path) != digest:
-            raise DataError(path, None, CHANGED)
     first = _layout(tasks[0], raw[0])
     for task, data in zip(tasks, raw, strict=True):
         if (layout := _layout(task, data)) != first:
@@ -244,12 +245,7 @@ def check_demonstrations(data_dir: Path, tasks: Sequence[Task]) -> bool:
         >>> check_demonstrations(Path(tempfile.mkdtemp()), [])
         False
     """
-    path = data_dir / "statistics.json"
-    try:
-        each = read_json(path, "the statistics of a data set")["tasks"]
-        known = {name: str(each[name]["sha256"]) for name in each if "sha256" in each[name]}
-    except (DataError, KeyError, TypeError):  # reported when it is read
-        return False
+    known = _known_content(data_dir)
     for task in tasks:
         file = demonstration_path(data_dir, task.name)
         if task.name not in known or not file.is_file():
@@ -258,14 +254,27 @@ def check_demonstrations(data_dir: Path, tasks: Sequence[Task]) -> bool:
             with open_sources(file) as sources:  # damage is named more exactly
                 for _ in Stream(sources):
                     pass
-            raise DataError(
-                file,
-                None,
-                f"its content is {digest[:12]} and was {known[task.name][:12]} (SHA-256) when "
-                f"{path.name} was written, which normalises the observations of this run; valid: "
-                "the file as it was, or another run_dir",
-            )
+            raise _other_content(file, digest, known[task.name])
     return list(known) == [task.name for task in tasks]
+
+
+def _known_content(data_dir: Path) -> dict[str, str]:
+    """SHA-256 of the tasks' files when their statistics were computed; none in earlier versions."""
+    try:
+        each = read_json(data_dir / "statistics.json", "the statistics of a data set")["tasks"]
+        return {name: str(each[name]["sha256"]) for name in each if "sha256" in each[name]}
+    except (DataError, KeyError, TypeError):  # reported when the statistics are read
+        return {}
+
+
+def _other_content(file: Path, now: str, before: str) -> DataError:
+    return DataError(
+        file,
+        None,
+        f"its content is {now[:12]} and was {before[:12]} (SHA-256) when statistics.json was "
+        "written, which normalises the observations of this run; valid: the file as it was, or "
+        "another run_dir",
+    )
 
 
 def _layout(task: Task, data: TensorDictBase) -> str:
@@ -321,7 +330,8 @@ def load_transitions(
         under ``"next"`` ``observation``, ``reward``, ``done``, ``terminated``, ``truncated``.
 
     Raises:
-        DataError: for a file that :func:`read_demonstrations` refuses.
+        DataError: for a file that :func:`read_demonstrations` refuses, and for other content than
+            that of the statistics.
 
     Example:
         >>> import tempfile
@@ -345,6 +355,7 @@ def load_transitions(
         torch.Size([5, 7])
     """
     path = demonstration_path(data_dir, task.name)
-    data = read_demonstrations(path, task, split=split, index=index)
+    known = _known_content(data_dir).get(task.name)
+    data = read_demonstrations(path, task, split=split, index=index, sha256=known)
     # The same keys for every task: other arrays may differ from file to file.
     return transform_data(data, task, statistics).select(*TRANSITION_KEYS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import reprlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from math import prod
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_bmrl.data.arrays import refuse_pointer
+from torchrl_bmrl.data.arrays import capacity, refuse_pointer
 from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.extras import needs
 
@@ -47,11 +47,11 @@ def open_file(path: str | Path) -> h5py.File:
         raise DataError(path, None, f"not a complete HDF5 file ({error})") from error
 
 
-def update_digest(digest: Any, path: str | Path, file: h5py.File) -> None:
-    """Adds the bytes of an open file to a digest: of this file, even if its name has another now.
+def update_digests(digests: Iterable[Any], path: str | Path, file: h5py.File) -> None:
+    """Adds the bytes of an open file to digests: of this file, even if its name has another now.
 
     Args:
-        digest: one of hashlib's.
+        digests: hashlib's.
         path: of the file, for messages.
         file: open for reading.
 
@@ -61,7 +61,8 @@ def update_digest(digest: Any, path: str | Path, file: h5py.File) -> None:
     try:
         handle, start = file.id.get_vfd_handle(), 0
         while block := os.pread(handle, 1 << 20, start):
-            digest.update(block)
+            for digest in digests:
+                digest.update(block)
             start += len(block)
     except DAMAGE as error:
         raise DataError(path, None, f"unreadable ({error})") from error
@@ -101,12 +102,6 @@ def read_node(path: str | Path, file: h5py.File, key: str) -> Any:
         return _within(path, file, key)
 
 
-def capacity(path: str | Path, stored: int | None = None) -> int:
-    """Largest number of bytes that decompressing a file, or that many bytes of it, can yield."""
-    # gzip compresses zeros to about a thousandth, and nothing to less.
-    return 2**20 + 1100 * os.path.getsize(path) if stored is None else 1100 * stored
-
-
 def _within(path: str | Path, file: h5py.File, key: str) -> Any:
     """A node whose content lies in this file and is not larger than the file can hold.
 
@@ -123,9 +118,9 @@ def _within(path: str | Path, file: h5py.File, key: str) -> Any:
         if node.external or node.is_virtual:
             raise DataError(path, key, "its content lies in other files; valid: in this file")
         # Rows that were never written take no space. An array with several names is read as often.
-        written = os.path.getsize(path) + 2**16 + capacity(path, node.id.get_storage_size())
+        written = os.path.getsize(path) + 2**16 + capacity(node.id.get_storage_size())
         times = prod(h5py.h5o.get_info(file.id, name).rc for name in names)
-        if node.nbytes > written or times * node.nbytes > capacity(path):
+        if node.nbytes > written or times * node.nbytes > 2**20 + capacity(os.path.getsize(path)):
             often = f" under {times} names" if times > 1 else ""
             message = f"claims {node.nbytes} bytes{often}, more than the file can hold"
             raise DataError(path, key, message)
@@ -318,9 +313,7 @@ def _write_attribute(group: h5py.Group, name: str, value: Any) -> None:
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return [_plain(element) for element in value.tolist()]
-    if isinstance(value, bytes):
-        return _text(value)
-    if isinstance(value, str):
+    if isinstance(value, bytes | str):
         return _text(value)
     return value.item() if isinstance(value, np.generic) else value
 

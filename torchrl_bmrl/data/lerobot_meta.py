@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchrl_bmrl.data.arrays import refuse_pointer
+from torchrl_bmrl.data.arrays import capacity, refuse_pointer
 from torchrl_bmrl.data.schema import MAX_FPS
 from torchrl_bmrl.errors import DataError
 from torchrl_bmrl.extras import needs
@@ -204,6 +204,6 @@ def _check_size(file: Path, metadata: Any) -> None:
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     values = sum(group.column(i).num_values for group in groups for i in range(group.num_columns))
     # Each row has its own index, and a number takes 8 bytes at most.
-    if rows > 2**12 + size or 8 * values > 2**20 + 1100 * size:
+    if rows > 2**12 + size or 8 * values > 2**20 + capacity(size):
         message = f"claims {rows} rows and {values} values, more than the file can hold"
         raise DataError(file, None, message)

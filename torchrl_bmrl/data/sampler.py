@@ -85,6 +85,22 @@ def _private(leaf: Tensor) -> Tensor:
     return content.view(leaf.dtype).view(leaf.shape)
 
 
+def read_sampler(path: Path) -> dict[str, Any]:
+    """What :meth:`TaskSampler.dumps` wrote.
+
+    Args:
+        path: the folder.
+
+    Raises:
+        DataError: if it is missing or damaged.
+    """
+    file = path / "sampler_metadata.json"
+    state = read_json(file, "the state of a sampler")
+    if not isinstance(state, dict) or not {"sizes", "weights"} <= state.keys():
+        raise DataError(file, None, "valid: sizes and weights")
+    return state
+
+
 class TaskSampler(Sampler):
     """Samples with replacement from data sets that are concatenated in one storage.
 
@@ -154,11 +170,7 @@ class TaskSampler(Sampler):
 
     def loads(self, path: str | Path) -> None:
         """Loads what :meth:`dumps` wrote, as :meth:`load_state_dict` does."""
-        file = Path(path) / "sampler_metadata.json"
-        state = read_json(file, "the state of a sampler")
-        if not isinstance(state, dict) or not {"sizes", "weights"} <= state.keys():
-            raise DataError(file, None, "valid: sizes and weights")
-        self.load_state_dict(state)
+        self.load_state_dict(read_sampler(Path(path)))
 
     def _empty(self) -> None:
         """Does nothing: the data sets stay."""
@@ -219,9 +231,11 @@ class DatasetBuffer(TensorDictReplayBuffer):
             BMRLError: for data sets of other sizes.
         """
         path = Path(path).absolute()
+        if not path.is_dir():
+            raise DataError(path, None, "not a dump of these data (no such folder)")
         try:
             # Nothing changes unless all can be read. TorchRL's reader would also load pickles.
-            state = json.loads((path / "sampler" / "sampler_metadata.json").read_text())
+            state = read_sampler(path / "sampler")
             read_memmap(path / "storage")
             if (path / "rng_state").exists():
                 read_memmap(path / "rng_state")

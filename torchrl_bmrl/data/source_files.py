@@ -10,6 +10,7 @@ from torchrl_bmrl.errors import DataError
 HDF5 = (".hdf5", ".h5")
 READ = (*HDF5, ".json", ".jsonl", ".parquet")
 """Ends of the files that are read in the folder of a data set; pictures and films are not."""
+CHANGED = "changed while it was read; valid: a file that no process writes or replaces"
 
 
 def files_of(source: str | os.PathLike[str]) -> list[Path]:
@@ -63,6 +64,3 @@ def check_unchanged(source: Path, before: Identity) -> None:
     for path in sorted(now.keys() | before.keys()):
         if now.get(path) != before.get(path):
             raise DataError(path, None, CHANGED)
-
-
-CHANGED = "changed while it was read; valid: a file that no process writes or replaces"

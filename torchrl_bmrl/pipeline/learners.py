@@ -140,7 +140,9 @@ class Agents:
         self.run, self.agents, self.names = run, agents, list(agents)
         settings, self.device = run.settings.bcq, run.settings.device
         self.options = loss_options(settings) | sizes_of(datasets[0])
-        self.rewards = [data["next", "reward"] for data in datasets]
+        rewards = [data["next", "reward"] for data in datasets]
+        self.limits = [value_limits(reward, settings.gamma) for reward in rewards]
+        self.largest = [largest_metric(reward) for reward in rewards]
         losses = []
         for name in self.names:  # the same initial networks alone and in a stack
             torch.manual_seed(run.seed("bcq", name))
@@ -195,9 +197,7 @@ class Agents:
             mine = batch if self.kind == "bcq" else batch[i]
             where = f"bcq {name}, update {update}"
             try:
-                limits = value_limits(self.rewards[i], self.run.settings.bcq.gamma)
-                largest = largest_metric(self.rewards[i])
-                check_metrics(rows[name], where, limits, largest=largest)
+                check_metrics(rows[name], where, self.limits[i], largest=self.largest[i])
                 check_proposals(self.proposals(name, mine), mine["action"], where)
             except BMRLError as error:
                 self.diverged[name] = str(error)

@@ -30,15 +30,6 @@ def is_task_name(x: Any) -> bool:
 
 def are_statistics(x: Any, size: int) -> bool:
     """Whether they are mean and scale of an observation of this size."""
-    if not isinstance(x, dict) or set(x) - {"parts"} != {"loc", "scale"}:
-        return False
-    parts = x.get("parts", [])
-    if not isinstance(parts, list) or not all(map(is_name, parts)):
-        return False
-    if not all(
-        isinstance(x[key], list) and all(map(is_number, x[key])) for key in ("loc", "scale")
-    ):
-        return False
     try:
         return len(ObservationStatistics.from_lists(x).loc) == size
     except BMRLError:

@@ -234,10 +234,10 @@ class Run:
             name: name of the task.
             split: ``"train"``, ``"valid"`` or ``"context"``.
         """
-        index, task = self.names.index(name), self.task(name)
-        data = load_transitions(self.data_dir, task, self.statistics, split=split, index=index)
-        check_demonstrations(self.data_dir, [task])  # of what was read
-        return data
+        index = self.names.index(name)
+        return load_transitions(
+            self.data_dir, self.tasks[index], self.statistics, split=split, index=index
+        )
 
     @property
     def has_contexts(self) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import io
 import json
 from collections.abc import Mapping, Sequence
@@ -113,7 +112,7 @@ def read_films(path: Path) -> Films:
             task, episode, step = map(int, moment.split())
             frames[task, episode, step] = base64.b64decode(frame, validate=True)
         return Films(frames=frames, note=str(content["note"]))
-    except (KeyError, ValueError, TypeError, AttributeError, binascii.Error) as error:
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
         raise DataError(path, None, f"not films ({error}); remove it") from error
 
 

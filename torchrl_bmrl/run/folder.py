@@ -154,10 +154,8 @@ def check_files(run_dir: Path, files: Files) -> dict[str, str]:
         ...
         torchrl_bmrl.errors.ConfigError: ...: the content of evaluate.policy (.../policy) is ...
     """
-    now, before = (
-        {key: digest_of(*paths) for key, paths in files.items() if paths},
-        _inputs(run_dir),
-    )
+    before = _inputs(run_dir)
+    now = {key: digest_of(*paths) for key, paths in files.items() if paths}
     for key, digest in now.items():
         if before.get(key, digest) != digest:
             raise ConfigError(
@@ -299,16 +297,15 @@ def read_yaml(path: Path) -> dict[str, Any]:
         content = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except (FileNotFoundError, IsADirectoryError) as error:
         raise DataError(path, None, "no such file") from error
-    # PyYAML raises the last ones for tags that do not fit their values.
-    except (yaml.YAMLError, ValueError, RecursionError, *_ODD_TAGS) as error:
+    except (
+        *(yaml.YAMLError, ValueError, RecursionError),
+        *(AttributeError, LookupError, TypeError),  # of tags that do not fit their values
+    ) as error:
         raise DataError(path, None, f"not YAML ({' '.join(str(error).split())})") from error
     if not isinstance(content, dict):
         found = "is empty" if content is None else f"contains a {type(content).__name__}"
         raise DataError(path, None, f"{found}; valid: a mapping")
     return content
-
-
-_ODD_TAGS = (AttributeError, LookupError, TypeError)
 
 
 class _Loader(yaml.SafeLoader):
