@@ -58,8 +58,8 @@ def test_a_written_demonstration_has_no_path_of_its_machine(tmp_path: Path) -> N
         assert episodes["demo_0"].attributes["model_file"] == MODEL.format(OWN)
 
 
+@pytest.mark.robosuite
 def test_both_forms_are_found_where_robosuite_is_installed_as_robosuite_finds_them() -> None:
-    pytest.importorskip("robosuite", exc_type=ImportError)
     from robosuite.environments.base import MujocoEnv
 
     spec = find_spec("robosuite")
@@ -74,6 +74,7 @@ def test_both_forms_are_found_where_robosuite_is_installed_as_robosuite_finds_th
             assert [mesh.get("file") for mesh in ET.fromstring(found).iter("mesh")] == [str(file)]
 
 
+@pytest.mark.robosuite
 @pytest.mark.parametrize(
     ("path", "said"),
     [
@@ -82,7 +83,6 @@ def test_both_forms_are_found_where_robosuite_is_installed_as_robosuite_finds_th
     ],
 )
 def test_a_missing_mesh_is_named_and_not_the_renderer(path: str, said: str) -> None:
-    pytest.importorskip("robosuite", exc_type=ImportError)
     from torchrl_bmrl.envs.rendering import render_states
 
     with pytest.raises(DataError, match=said):

@@ -28,7 +28,10 @@ from torchrl_bmrl.envs.assets import find_assets
 from torchrl_bmrl.envs.compiling import compile_scene
 from torchrl_bmrl.errors import DataError
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that are copies")
+pytestmark = [
+    pytest.mark.robosuite,
+    pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that are copies"),
+]
 ASSETS = Path(next(iter(find_spec("robosuite").submodule_search_locations)), "models", "assets")
 
 
