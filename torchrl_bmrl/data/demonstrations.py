@@ -242,7 +242,8 @@ def check_demonstrations(data_dir: Path, tasks: Sequence[Task]) -> bool:
 
     Example:
         >>> import tempfile
-        >>> check_demonstrations(Path(tempfile.mkdtemp()), [])
+        >>> from torchrl_bmrl.tasks import get_task
+        >>> check_demonstrations(Path(tempfile.mkdtemp()), [get_task("reach")])
         False
     """
     known = _known_content(data_dir)
