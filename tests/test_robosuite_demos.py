@@ -113,6 +113,21 @@ def test_a_model_may_lie_in_a_file_or_in_the_attribute(copy: Path, own_episode: 
     assert_close(own_episode, read(copy, tracking=TRACKING))
 
 
+@pytest.mark.parametrize("linked", ["models", "models/model_1.xml"])
+def test_a_model_behind_a_link_is_refused(copy: Path, tmp_path: Path, linked: str) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    (elsewhere / "models").mkdir(parents=True)
+    with h5py.File(copy, "r+") as file:
+        attributes = file["data/demo_1"].attrs
+        (elsewhere / "models/model_1.xml").write_text(attributes["model_file"])
+        attributes["model_file"] = "model_1.xml"
+    if linked != "models":
+        (copy.parent / "models").mkdir()
+    (copy.parent / linked).symlink_to(elsewhere / linked)
+    with pytest.raises(DataError, match=r"model_1\.xml is behind a link; valid: a file"):
+        read(copy, tracking=TRACKING)
+
+
 OPENINGS = {
     "open, close on nothing, open": (
         [23, 23, 18, 10, 0, -10, -22, -22, -22, -15, 0, 20, 23, 23],

@@ -73,10 +73,9 @@ def _compile(path: Path, key: str, model_file: str) -> mujoco.MjModel:
         if not model_file.lstrip().startswith("<"):
             model_path = path.parent / "models" / Path(model_file).name
             label = str(model_path)
-            if model_path.is_symlink():
-                raise DataError(
-                    path, key, f"{label} is a link; valid: a file in {model_path.parent}"
-                )
+            if model_path.is_symlink() or model_path.parent.is_symlink():
+                message = f"{label} is behind a link; valid: a file in a folder beside {path.name}"
+                raise DataError(path, key, message)
             if not model_path.is_file():
                 there = ", ".join(sorted(file.name for file in model_path.parent.glob("*.xml")))
                 raise DataError(path, key, f"{label} is missing; there: {there or 'no models'}")
