@@ -21,10 +21,11 @@ from episode_files import write_file
 from file_runs import PARTS, file_run, write_demonstrations
 from small_runs import study_run
 
+from torchrl_bmrl.data import demonstrations
 from torchrl_bmrl.data.source_files import files_of
 from torchrl_bmrl.errors import BMRLError, CheckpointError, ConfigError, DataError
 from torchrl_bmrl.evaluation.rollout import EpisodeOutcome
-from torchrl_bmrl.files import write_atomic
+from torchrl_bmrl.files import digest_of, write_atomic
 from torchrl_bmrl.pipeline import Run, collect, held_out, stage1, stage2
 from torchrl_bmrl.pipeline.evaluate import evaluate_once
 from torchrl_bmrl.run.folder import INPUTS, check_files, check_made_from, open_run
@@ -246,6 +247,22 @@ def test_demonstrations_that_were_replaced_are_refused_and_statistics_stay(train
     with pytest.raises(DataError, match=r"drawer.hdf5: its content is"):
         trained.transitions("drawer", "train")
     assert path.read_bytes() == before
+
+
+def test_a_file_that_is_replaced_after_its_digest_gives_no_statistics(
+    trained: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (trained.data_dir / "statistics.json").unlink()
+
+    def digest(path: Path) -> str:
+        before = digest_of(path)
+        write_other(path)
+        return before
+
+    monkeypatch.setattr(demonstrations, "digest_of", digest)
+    with pytest.raises(DataError, match=r"hdf5: its content is"):
+        demonstrations.write_statistics(trained.data_dir, trained.tasks)
+    assert not (trained.data_dir / "statistics.json").exists()
 
 
 def test_statistics_are_computed_once_and_without_digests_anew(trained: Run) -> None:
