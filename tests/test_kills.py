@@ -52,12 +52,21 @@ The checkpoint before the newest is another one if the run was asked to stop jus
 """
 
 
+def hear_hangups() -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup, which a run obeys, ignores them
+
+
 def start(folder: Path) -> subprocess.Popen[bytes]:
     settings = [*(["preset=smoke"] if KILLS else SMALL), "workers=2", f"run_dir={folder}"]
     command = [sys.executable, str(RECIPES / "two_stage.py"), *settings]
     with (folder.parent / f"{folder.name}.log").open("ab") as log:
         return subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=log, cwd=folder.parent, start_new_session=True
+            command,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            cwd=folder.parent,
+            start_new_session=True,
+            preexec_fn=hear_hangups,
         )
 
 
