@@ -18,7 +18,7 @@ import torch
 from torchrl_bmrl.errors import ConfigError, FolderInUseError, StoppedError
 from torchrl_bmrl.run import stops
 from torchrl_bmrl.run.command_line import exit_codes
-from torchrl_bmrl.run.stops import check_stop, stop_on_signals
+from torchrl_bmrl.run.stops import beside, check_stop, stop_on_signals
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
@@ -226,3 +226,29 @@ def test_a_write_that_the_system_refuses_is_one_line_and_the_old_file_stays(tmp_
     assert "Traceback" not in done.stderr
     assert load_checkpoint(path, kind="a")[1]["size"] == 10
     assert os.listdir(tmp_path) == [path.name]
+
+
+def test_what_is_called_beside_gives_its_result_or_its_error() -> None:
+    threads = beside(threading.current_thread), threading.current_thread()
+    assert threads[0].result() is not threads[1]
+    with pytest.raises(ZeroDivisionError):
+        beside(lambda: 1 / 0).result()
+
+
+def test_a_stopped_process_waits_for_nothing_that_is_called_beside_and_says_one_line() -> None:
+    script = (
+        "import signal, time\n"
+        "from torchrl_bmrl.run.command_line import exit_codes\n"
+        "from torchrl_bmrl.run.stops import beside, check_stop\n"
+        "def evaluate():\n"
+        "    looked = beside(time.sleep, 600)\n"
+        "    signal.raise_signal(signal.SIGTERM)\n"
+        "    check_stop()\n"
+        "with exit_codes():\n"
+        "    evaluate()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 128 + signal.SIGTERM
+    assert done.stderr.splitlines() == [str(StoppedError(signal.SIGTERM))]

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from itertools import cycle
-from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -35,6 +34,7 @@ from torchrl_bmrl.reports.films import explore_demonstrations
 from torchrl_bmrl.reports.tables import task_titles
 from torchrl_bmrl.rows import check_rows
 from torchrl_bmrl.run.folder import read_versions
+from torchrl_bmrl.run.stops import beside
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.tasks import Task
 from torchrl_bmrl.training.checkpoint import load_checkpoint
@@ -73,9 +73,8 @@ def evaluate(run: Run) -> str:
     look = not alone and shows_embedding(run)
     looked = None
     if look and run.playable and run.settings.workers > 1:
-        # Beside the episodes, in a thread that ends with this process. With one worker they are
-        # played here, and both draw from PyTorch's global generator.
-        looked = ThreadPool(1).apply_async(look_at_embedding, [run])
+        # With one worker the episodes are played here: both would draw from PyTorch's generator.
+        looked = beside(look_at_embedding, run)
     if run.playable:
         jobs = [] if alone else jobs_without_student(run)
         for source in settings.latent_sources:
@@ -100,7 +99,7 @@ def evaluate(run: Run) -> str:
         titles=run.titles,
         tables=tables,
         seed=run.settings.seed,
-        **(looked.get() if looked else look_at_embedding(run) if look else {}),
+        **(looked.result() if looked else look_at_embedding(run) if look else {}),
     )
     table = (run.folder / "tables" / f"{shown}.md").read_text(encoding="utf-8")
     return f"{table}\nreport: {run.folder / 'report.html'}"
@@ -332,14 +331,14 @@ def look_at_embedding(run: Run) -> dict[str, Any]:
     training, titles = embed(run, "train")[0], task_titles(run.names, run.titles)
     # Films are rendered in another process. Waiting for it changes PyTorch's number of threads, and
     # so the last bits of what is computed meanwhile: all embeddings come first.
-    films = ThreadPool(1).apply_async(films_of, [run])
+    films = beside(films_of, run)
     return {
         "embeddings": embeddings,
         "training": training,
         "accuracy": accuracy,
         "drawn": draw_embeddings(embeddings, training, titles, seed=run.settings.seed),
         "explorer": explore_demonstrations(
-            run.data_dir, embeddings, films.get(), titles=run.titles
+            run.data_dir, embeddings, films.result(), titles=run.titles
         ),
     }
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import partial
 from types import FrameType
+from typing import Any, TypeVar
 
 from torchrl_bmrl.errors import StoppedError
 from torchrl_bmrl.run.forked import FOR_THE_RUN
 
+T = TypeVar("T")
 REPEATS = 1.0
 """Seconds in which further signals are the same request.
 
@@ -107,3 +110,31 @@ def stop_on_signals(*, at_once: bool = False) -> Iterator[None]:
         _asked = None
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def beside(function: Callable[..., T], *arguments: Any) -> Future[T]:
+    """Calls a function in a thread of its own.
+
+    A process that is stopped does not wait for this thread, as it would for those of a pool.
+
+    Args:
+        function: what to call.
+        *arguments: its arguments.
+
+    Returns:
+        the result to come, or the error.
+
+    Example:
+        >>> beside(sum, [1, 2]).result()
+        3
+    """
+    future: Future[T] = Future()
+
+    def call() -> None:
+        try:
+            future.set_result(function(*arguments))
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=call, daemon=True).start()
+    return future
