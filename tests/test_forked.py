@@ -166,31 +166,35 @@ def test_a_process_that_starts_gets_its_signals_when_it_is_ready() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "beside", "starts"),
+    ("arguments", "beside", "imports"),
     [
-        ([], "command.py", True),
-        (["preset=smoke", "tasks=[reach]"], "command.py", True),
-        (["--help"], "command.py", False),
-        (["preset=smoke", "workers=1"], "command.py", False),
-        ([], "other.py", False),
+        ([], "command.py", ["torchrl_bmrl.pipeline", "torchrl_bmrl.envs.vector"]),
+        (["preset=smoke", "tasks=[reach]"], "command.py", ["torchrl_bmrl.pipeline"]),
+        (["--help"], "command.py", None),
+        (["preset=smoke", "workers=1"], "command.py", None),
+        ([], "other.py", None),
     ],
 )
 def test_a_recipe_starts_its_server_before_it_imports_torch(
-    tmp_path: Path, arguments: list[str], beside: str, starts: bool
+    tmp_path: Path, arguments: list[str], beside: str, imports: list[str] | None
 ) -> None:
     (tmp_path / beside).touch()
     script = tmp_path / "recipe.py"
     script.write_text(
         "import json, sys\n"
         "from multiprocessing import forkserver\n"
+        "from torchrl_bmrl.run import forked\n"
+        "start, given = forked.start_server, []\n"
+        "forked.start_server = lambda *names: [given.append(names), start(*names)]\n"
         "import torchrl_bmrl.run.early_server\n"
         "server = forkserver._forkserver._forkserver_pid\n"
-        "print(json.dumps([server is not None, 'torch' in sys.modules]))\n"
+        "print(json.dumps([server is not None, given, 'torch' in sys.modules]))\n"
     )
     done = subprocess.run(
         [sys.executable, str(script), *arguments], capture_output=True, text=True, check=True
     )
-    assert json.loads(done.stdout) == [starts, False]
+    given = [] if imports is None else [imports]
+    assert json.loads(done.stdout) == [imports is not None, given, False]
 
 
 @pytest.mark.robosuite
