@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ import torch
 from torchrl_bmrl.errors import ConfigError, FolderInUseError, StoppedError
 from torchrl_bmrl.run import stops
 from torchrl_bmrl.run.command_line import exit_codes
-from torchrl_bmrl.run.stops import beside, check_stop, stop_on_signals
+from torchrl_bmrl.run.stops import beside, check_stop, stop_on_signals, wait_for
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
@@ -229,21 +230,46 @@ def test_a_write_that_the_system_refuses_is_one_line_and_the_old_file_stays(tmp_
 
 
 def test_what_is_called_beside_gives_its_result_or_its_error() -> None:
-    threads = beside(threading.current_thread), threading.current_thread()
-    assert threads[0].result() is not threads[1]
-    with pytest.raises(ZeroDivisionError):
-        beside(lambda: 1 / 0).result()
+    with beside(threading.current_thread) as thread:
+        assert thread.result() is not threading.current_thread()
+    with pytest.raises(ZeroDivisionError), beside(lambda: 1 / 0) as error:
+        error.result()
 
 
-def test_a_stopped_process_waits_for_nothing_that_is_called_beside_and_says_one_line() -> None:
+def test_what_is_called_beside_ends_with_a_block_that_fails() -> None:
+    def work() -> None:
+        while True:
+            time.sleep(0.01)
+
+    threads = threading.active_count()
+    with pytest.raises(StoppedError), beside(work):
+        raise StoppedError(signal.SIGTERM)
+    assert threading.active_count() == threads
+
+
+def test_a_stop_does_not_wait_for_what_is_called_beside() -> None:
+    def work() -> None:
+        while True:
+            time.sleep(0.01)
+
+    with stop_on_signals():
+        signal.raise_signal(signal.SIGTERM)
+        with pytest.raises(StoppedError), beside(work) as result:
+            wait_for(result)
+
+
+def test_a_stopped_process_ends_what_is_called_beside_and_says_one_line() -> None:
     script = (
-        "import signal, time\n"
+        "import signal, time, torch\n"
         "from torchrl_bmrl.run.command_line import exit_codes\n"
         "from torchrl_bmrl.run.stops import beside, check_stop\n"
+        "def work():\n"
+        "    while True:\n"
+        "        torch.randn(200, 300).softmax(-1)\n"
         "def evaluate():\n"
-        "    looked = beside(time.sleep, 600)\n"
-        "    signal.raise_signal(signal.SIGTERM)\n"
-        "    check_stop()\n"
+        "    with beside(work):\n"
+        "        signal.raise_signal(signal.SIGTERM)\n"
+        "        check_stop()\n"
         "with exit_codes():\n"
         "    evaluate()\n"
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from itertools import cycle
 from pathlib import Path
@@ -34,7 +35,7 @@ from torchrl_bmrl.reports.films import explore_demonstrations
 from torchrl_bmrl.reports.tables import task_titles
 from torchrl_bmrl.rows import check_rows
 from torchrl_bmrl.run.folder import read_versions
-from torchrl_bmrl.run.stops import beside
+from torchrl_bmrl.run.stops import beside, wait_for
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.tasks import Task
 from torchrl_bmrl.training.checkpoint import load_checkpoint
@@ -71,27 +72,15 @@ def evaluate(run: Run) -> str:
         if not set(run.names) <= set(known):
             raise ConfigError(f"tasks is {list(run.names)}; valid for {settings.policy}: {known}")
     look = not alone and shows_embedding(run)
-    looked = None
-    if look and run.playable and run.settings.workers > 1:
-        # With one worker the episodes are played here: both would draw from PyTorch's generator.
-        looked = beside(look_at_embedding, run)
-    if run.playable:
-        jobs = [] if alone else jobs_without_student(run)
-        for source in settings.latent_sources:
-            jobs += [(task, "distilled", source) for task in run.names]
-        if settings.reference and not alone:
-            jobs += [(task.name, "reference", "") for task in run.tasks if task.record is not None]
-        rows = run.jobs(
-            evaluate_job,
-            jobs,
-            total=sum(settings.episodes * run.horizon(run.task(task)) for task, *_ in jobs),
-            description="evaluating",
-            unit="step",
-        )
-        write_results(run.folder / "results.csv", [row for part in rows for row in part])
-        tables, shown = {}, "results"
-    else:
-        tables, shown = {"held_out": evaluate_held_out(run)}, "held_out"
+    # With one worker the episodes are played here: both would draw from PyTorch's generator.
+    at_once = look and run.playable and run.settings.workers > 1
+    with beside(look_at_embedding, run) if at_once else nullcontext() as looked:
+        if run.playable:
+            play(run)
+            tables, shown = {}, "results"
+        else:
+            tables, shown = {"held_out": evaluate_held_out(run)}, "held_out"
+        seen = wait_for(looked) if looked else look_at_embedding(run) if look else {}
     write_report(
         run.folder,
         default_source=settings.latent_sources[0],
@@ -99,10 +88,32 @@ def evaluate(run: Run) -> str:
         titles=run.titles,
         tables=tables,
         seed=run.settings.seed,
-        **(looked.result() if looked else look_at_embedding(run) if look else {}),
+        **seen,
     )
     table = (run.folder / "tables" / f"{shown}.md").read_text(encoding="utf-8")
     return f"{table}\nreport: {run.folder / 'report.html'}"
+
+
+def play(run: Run) -> None:
+    """Plays the episodes of all policies, and writes ``results.csv``.
+
+    Args:
+        run: an open run whose tasks have environments.
+    """
+    settings, alone = run.settings.evaluate, run.settings.evaluate.policy is not None
+    jobs = [] if alone else jobs_without_student(run)
+    for source in settings.latent_sources:
+        jobs += [(task, "distilled", source) for task in run.names]
+    if settings.reference and not alone:
+        jobs += [(task.name, "reference", "") for task in run.tasks if task.record is not None]
+    rows = run.jobs(
+        evaluate_job,
+        jobs,
+        total=sum(settings.episodes * run.horizon(run.task(task)) for task, *_ in jobs),
+        description="evaluating",
+        unit="step",
+    )
+    write_results(run.folder / "results.csv", [row for part in rows for row in part])
 
 
 def jobs_without_student(run: Run) -> list[tuple[str, str, str]]:
@@ -331,15 +342,17 @@ def look_at_embedding(run: Run) -> dict[str, Any]:
     training, titles = embed(run, "train")[0], task_titles(run.names, run.titles)
     # Films are rendered in another process. Waiting for it changes PyTorch's number of threads, and
     # so the last bits of what is computed meanwhile: all embeddings come first.
-    films = beside(films_of, run)
+    with beside(films_of, run) as films:
+        drawn = draw_embeddings(embeddings, training, titles, seed=run.settings.seed)
+        explorer = explore_demonstrations(
+            run.data_dir, embeddings, films.result(), titles=run.titles
+        )
     return {
         "embeddings": embeddings,
         "training": training,
         "accuracy": accuracy,
-        "drawn": draw_embeddings(embeddings, training, titles, seed=run.settings.seed),
-        "explorer": explore_demonstrations(
-            run.data_dir, embeddings, films.result(), titles=run.titles
-        ),
+        "drawn": drawn,
+        "explorer": explorer,
     }
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from contextlib import contextmanager
 from functools import partial
 from types import FrameType
@@ -112,20 +113,23 @@ def stop_on_signals(*, at_once: bool = False) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def beside(function: Callable[..., T], *arguments: Any) -> Future[T]:
-    """Calls a function in a thread of its own.
+@contextmanager
+def beside(function: Callable[..., T], *arguments: Any) -> Iterator[Future[T]]:
+    """Calls a function in a thread that ends with the block.
 
-    A process that is stopped does not wait for this thread, as it would for those of a pool.
+    After an error in the block, such as a stop, the thread ends at its next line of Python. If it
+    still ran when the process ends, it could abort it.
 
     Args:
         function: what to call.
         *arguments: its arguments.
 
-    Returns:
+    Yields:
         the result to come, or the error.
 
     Example:
-        >>> beside(sum, [1, 2]).result()
+        >>> with beside(sum, [1, 2]) as total:
+        ...     total.result()
         3
     """
     future: Future[T] = Future()
@@ -136,5 +140,35 @@ def beside(function: Callable[..., T], *arguments: Any) -> Future[T]:
         except BaseException as error:
             future.set_exception(error)
 
-    threading.Thread(target=call, daemon=True).start()
-    return future
+    thread = threading.Thread(target=call)
+    thread.start()
+    try:
+        yield future
+    except BaseException:
+        # The interpreter has no other way to end a thread that does not ask.
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(
+            ctypes.c_ulong(thread.ident or 0), ctypes.py_object(SystemExit)
+        )
+        raise
+    finally:
+        thread.join()
+
+
+def wait_for(future: Future[T]) -> T:
+    """The result of a :func:`beside`, or its error; a stop does not wait for it.
+
+    Args:
+        future: the result to come.
+
+    Raises:
+        StoppedError: if a signal was received.
+
+    Example:
+        >>> with beside(sum, [1, 2]) as total:
+        ...     wait_for(total)
+        3
+    """
+    while not future.done():
+        check_stop()
+        wait([future], timeout=0.2)
+    return future.result()
