@@ -6,7 +6,10 @@ from __future__ import annotations
 import importlib
 import io
 import os
+import signal
 import sys
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,9 +24,10 @@ for extra in ("scipy", "matplotlib", "jinja2", "sklearn", "mujoco"):
 from explorers import TASKS
 from PIL import Image
 
-from torchrl_bmrl.errors import BMRLError, DataError, RenderError
+from torchrl_bmrl.errors import BMRLError, DataError, RenderError, StoppedError
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.reports import Embeddings
+from torchrl_bmrl.run.stops import stop_on_signals
 
 
 def write_demonstrations(folder: Path, *, states: bool = True) -> Embeddings:
@@ -293,3 +297,27 @@ def test_films_are_of_the_first_held_out_episodes(tmp_path: Path) -> None:
     picture = Image.open(io.BytesIO(explorer.frames[lift, 0, 0]))
     assert (picture.format, picture.size) == ("WEBP", (192, 192))
     assert "2 episodes have a film" in explorer.paragraphs()[-1]
+
+
+@pytest.mark.robosuite
+@pytest.mark.timeout(120)
+@pytest.mark.usefixtures("signals_not_ignored")
+def test_a_stop_does_not_wait_for_the_figures_of_the_embedding(
+    finished_copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from small_runs import SMALL, settings_of
+
+    module = importlib.import_module("torchrl_bmrl.pipeline.evaluate")
+
+    def look_at_embedding(run: Run) -> dict[str, Any]:
+        os.kill(os.getpid(), signal.SIGTERM)
+        while True:
+            time.sleep(0.01)
+
+    monkeypatch.setattr(module, "look_at_embedding", look_at_embedding)
+    monkeypatch.setattr(module, "play", lambda run: None)
+    settings = settings_of(*SMALL, f"run_dir={finished_copy}", "workers=2")
+    threads = threading.active_count()
+    with stop_on_signals(), Run(settings) as run, pytest.raises(StoppedError):
+        module.evaluate(run)
+    assert threading.active_count() == threads

@@ -32,7 +32,12 @@ from torchrl_bmrl.data.robomimic import open_episodes, read_kept_episode
 from torchrl_bmrl.evaluation import read_results
 from torchrl_bmrl.training.checkpoint import load_checkpoint
 
-pytestmark = [pytest.mark.robosuite, pytest.mark.slow, pytest.mark.timeout(0)]
+pytestmark = [
+    pytest.mark.robosuite,
+    pytest.mark.slow,
+    pytest.mark.timeout(0),
+    pytest.mark.usefixtures("signals_not_ignored"),  # a run inherits which ones are
+]
 KILLS = int(os.environ.get("BMRL_KILLS", "0"))
 ASKED = (signal.SIGTERM, signal.SIGHUP)
 EQUAL = (
@@ -52,21 +57,12 @@ The checkpoint before the newest is another one if the run was asked to stop jus
 """
 
 
-def hear_hangups() -> None:
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup, which a run obeys, ignores them
-
-
 def start(folder: Path) -> subprocess.Popen[bytes]:
     settings = [*(["preset=smoke"] if KILLS else SMALL), "workers=2", f"run_dir={folder}"]
     command = [sys.executable, str(RECIPES / "two_stage.py"), *settings]
     with (folder.parent / f"{folder.name}.log").open("ab") as log:
         return subprocess.Popen(
-            command,
-            stdout=subprocess.PIPE,
-            stderr=log,
-            cwd=folder.parent,
-            start_new_session=True,
-            preexec_fn=hear_hangups,
+            command, stdout=subprocess.PIPE, stderr=log, cwd=folder.parent, start_new_session=True
         )
 
 

@@ -164,8 +164,12 @@ def test_a_full_file_is_followed_by_the_next(
     for i, (chunk, file) in enumerate(places):
         table = pq.read_table(tmp_path / f"lift/data/chunk-{chunk:03d}/file-{file:03d}.parquet")
         assert set(table["episode_index"].to_pylist()) == {i}
+    total = json.loads((tmp_path / "lift/meta/stats.json").read_text())
     for name, array in expected_columns().items():
         assert_array_equal(read(tmp_path / "lift")[name], array)
+        assert total[name]["count"] == [len(array)]
+        rows = array.reshape(len(array), -1).astype(np.float64)
+        assert_allclose(total[name]["q50"], np.median(rows, axis=0))
 
 
 def test_one_number_a_step_is_no_list(tmp_path: Path) -> None:

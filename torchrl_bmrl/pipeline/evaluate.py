@@ -345,7 +345,7 @@ def look_at_embedding(run: Run) -> dict[str, Any]:
     with beside(films_of, run) as films:
         drawn = draw_embeddings(embeddings, training, titles, seed=run.settings.seed)
         explorer = explore_demonstrations(
-            run.data_dir, embeddings, films.result(), titles=run.titles
+            run.data_dir, embeddings, wait_for(films), titles=run.titles
         )
     return {
         "embeddings": embeddings,

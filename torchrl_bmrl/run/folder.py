@@ -297,9 +297,14 @@ def read_yaml(path: Path) -> dict[str, Any]:
         content = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except (FileNotFoundError, IsADirectoryError) as error:
         raise DataError(path, None, "no such file") from error
+    # PyYAML raises most of these for tags that do not fit their values.
     except (
-        *(yaml.YAMLError, ValueError, RecursionError),
-        *(AttributeError, LookupError, TypeError),  # of tags that do not fit their values
+        AttributeError,
+        LookupError,
+        RecursionError,
+        TypeError,
+        ValueError,
+        yaml.YAMLError,
     ) as error:
         raise DataError(path, None, f"not YAML ({' '.join(str(error).split())})") from error
     if not isinstance(content, dict):
