@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -68,6 +69,22 @@ def test_slow_loops_and_none_at_all_have_a_rate_that_one_can_read(done: int, say
     lines = Lines(10_000, "collecting", "episode")
     lines.update(done)
     assert lines.line(lines.started + 3600) == f"collecting: {says}"
+
+
+@pytest.mark.parametrize("started", [0.0, 4095.9, 30_000.3, 131_071.7])
+@pytest.mark.parametrize("seconds", [1, 60, 3600])
+def test_the_age_of_the_clock_does_not_change_the_unit_of_a_rate(
+    seconds: int, started: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A machine's clock counts from its start; the difference of two of its times is not exact.
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "time", SimpleNamespace(monotonic=lambda: started))
+        lines = Lines(None, "converting", "episode")
+    unit = {1: "s", 60: "min", 3600: "h"}[seconds]
+    for number in range(1, 200):
+        lines.update(1)
+        said = lines.line(started + seconds * number)
+        assert said == f"converting: {number} episodes, 1 episodes/{unit}"
 
 
 def test_without_a_total_the_rate_alone_is_said() -> None:

@@ -133,8 +133,10 @@ class Lines:
         return f"{_prefix}{self.description}: {where}"
 
     def _speed(self, rate: float) -> str:
-        per = "s" if rate >= 1 else "min" if rate >= 1 / 60 else "h"
-        speed = rate * {"s": 1, "min": 60, "h": 3600}[per]
+        seconds = {"s": 1, "min": 60, "h": 3600}
+        # Three digits, as printed: the last digits of the clock must not choose the unit.
+        per = next((unit for unit in seconds if float(f"{rate * seconds[unit]:.3g}") >= 1), "h")
+        speed = rate * seconds[per]
         number = f"{speed:,.0f}" if speed >= 100 else f"{speed:.3g}"
         return f"{number} {self.unit}s/{per}"
 
