@@ -82,7 +82,12 @@ def study_run(folder: Path, bcq: dict[str, Any] | None = None, **settings: Any) 
 
 def settings_of(*overrides: str) -> pipeline.Settings:
     """Settings of a run that a command line gives, without those of studies."""
-    values = OmegaConf.to_object(configured(*overrides))
+    return filled(configured(*overrides))
+
+
+def filled(config: Any) -> pipeline.Settings:
+    """The same of a configuration that is composed already."""
+    values = OmegaConf.to_object(config)
     names = [field.name for field in fields(pipeline.Settings)]
     return pipeline.Settings(**{name: getattr(values, name) for name in names})
 
