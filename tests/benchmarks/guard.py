@@ -5,14 +5,17 @@
     python tests/benchmarks/guard.py 6a526b6 --rows paper --rounds 1
 
 Each row runs the same command in both checkouts in turn, in an environment that both take, and
-prints both medians with their ranges and the median of the rounds' ratios. A commit that lacks a
-command gets no number. Linux only: memory is the sum of the proportional set sizes of all processes
-(``/proc/PID/smaps_rollup``), in which memory that processes share counts once.
+prints both medians with their ranges and the median of the rounds' ratios; stderr gets each round
+as it ends. A commit that lacks a command gets no number. Linux only: memory is the sum of the
+proportional set sizes of all processes (``/proc/PID/smaps_rollup``), in which memory that processes
+share counts once.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import json
 import os
 import re
 import shutil
@@ -23,10 +26,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from statistics import median
+from statistics import mean, median
 
 ROOT = Path(__file__).resolve().parents[2]
 Values = dict[str, float]
+EVALUATED = (("bcq", ""), ("distilled", "prototype"))  # policies and sources of m
 
 IMPORT = """
 import sys, time
@@ -133,15 +137,25 @@ def run(preset: str) -> Callable[[Path], Values]:
         with tempfile.TemporaryDirectory() as folder:
             command = [sys.executable, "recipes/two_stage.py", f"preset={preset}"]
             _, seconds, peak = measured([*command, f"run_dir={folder}/run"], tree)
-            table = Path(folder, "run", "tables", "results.md").read_text()
-        lines = [
-            line for line in table.splitlines() if "| BCQ |" in line or "| Distilled |" in line
-        ]
-        successes = [float(cell) for line in lines for cell in re.findall(r"\| (\d+)% \|", line)]
+            stages = json.loads(Path(folder, "run", "seconds.json").read_text())
+            episodes = list(
+                csv.DictReader(Path(folder, "run", "results.csv").read_text().splitlines())
+            )
+        of: dict[tuple[str, str], list[dict[str, str]]] = {}
+        for episode in episodes:
+            if (episode["policy"], episode["latent_source"]) in EVALUATED:
+                of.setdefault((episode["task"], episode["policy"]), []).append(episode)
+        returns = {key: mean(float(each["return"]) for each in of[key]) for key in of}
+        successes = {key: mean(each["success"] == "1" for each in of[key]) for key in of}
+        tasks = sorted({task for task, _ in returns})
+        shares = [returns[task, "distilled"] / returns[task, "bcq"] for task in tasks]
         return {
             f"{preset}: wall time [s]": seconds,
+            **{f"{preset}: {stage} [s]": float(each) for stage, each in stages.items()},
             f"{preset}: peak memory of all processes [MB]": peak,
-            f"{preset}: lowest success [%]": min(successes),
+            f"{preset}: lowest success [%]": 100 * min(successes.values()),
+            f"{preset}: lowest distilled / BCQ": min(shares),
+            **{f"{preset}: return of {key[1]}, {key[0]}": returns[key] for key in sorted(returns)},
         }
 
     return row
@@ -226,8 +240,9 @@ def main() -> None:
     with checkout(options.commit) as before:
         for name in options.rows:
             rounds: list[tuple[Values, Values]] = []
-            for _ in range(options.rounds):
+            for number in range(options.rounds):
                 rounds.append((ROWS[name](before), ROWS[name](ROOT)))
+                print(f"{name}, round {number}: {rounds[-1]}", file=sys.stderr, flush=True)
             for what in rounds[0][1]:
                 pairs = [(old[what], new[what]) for old, new in rounds if what in old]
                 old, new = ([pair[i] for pair in pairs] for i in range(2))
@@ -236,7 +251,7 @@ def main() -> None:
 
 
 def _range(values: list[float]) -> str:
-    return f"{median(values):.3g} [{min(values):.3g}, {max(values):.3g}]"
+    return f"{median(values):.4g} [{min(values):.4g}, {max(values):.4g}]"
 
 
 if __name__ == "__main__":

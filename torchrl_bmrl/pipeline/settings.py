@@ -77,7 +77,7 @@ class BCQSettings:
     epochs: int = setting(4, above=0)  # the agents are evaluated after each
     updates_per_epoch: int = setting(600, above=0)  # updates of each network
     eval_episodes: int = setting(2, at_least=0)  # after each epoch, for the curves; 0: no curves
-    batch_size: int = setting(128, above=0)  # transitions per update
+    batch_size: int = setting(100, above=0)  # transitions per update
     lr: float = setting(1e-3, above=0)  # learning rate of Adam
     cosine: bool = True  # the learning rate decays to zero
     num_cells: list[int] = setting([256, 256], above=0)  # widths of the hidden layers
@@ -132,7 +132,7 @@ class DistillSettings:
     inference_updates: int = setting(0, at_least=0)
     # Before these, updates of models of each task's reward, which relabel its contexts; 0: none.
     reward_updates: int = setting(0, at_least=0)
-    batch_size: int = setting(64, above=0)  # transitions of each task per update
+    batch_size: int = setting(48, above=0)  # transitions of each task per update
     lr: float = setting(1e-3, above=0)  # learning rate of Adam
     cosine: bool = True  # the learning rate decays to zero
     num_cells: list[int] = setting([256, 256], above=0)  # widths of the hidden layers
