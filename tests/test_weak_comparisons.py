@@ -88,5 +88,5 @@ def test_both_stages_are_compared_with_every_other_algorithm_start_by_start() ->
     for line, other in zip(table.rows[::2], ("bc", "iql"), strict=True):
         share = (returns("bcq").mean() - returns(other).mean()) / returns("expert").mean()
         assert line[column].startswith(f"{share:+.1%} [")
-    assert "### Both stages less each other algorithm" in make_weak_page(make_weak()).text
+    assert "### Both stages minus each other algorithm" in make_weak_page(make_weak()).text
     assert not stages_table([r for r in rows if r.policy not in ("bc", "iql")], TITLES).rows

@@ -41,10 +41,10 @@ LINES = [
     "BCQ: success",
     "Distilled (prototype): return as a share of BCQ's",
     "Distilled (prototype): success",
-    "BCQ less BC: paired difference, mean over tasks",
-    "BCQ less BC: paired difference, lowest task",
-    "BCQ less IQL: paired difference, mean over tasks",
-    "BCQ less IQL: paired difference, lowest task",
+    "BCQ minus BC: paired difference, mean over tasks",
+    "BCQ minus BC: paired difference, lowest task",
+    "BCQ minus IQL: paired difference, mean over tasks",
+    "BCQ minus IQL: paired difference, lowest task",
 ]
 
 
@@ -153,7 +153,7 @@ def test_where_the_ratio_is_out_of_reach_the_distance_to_the_optimum_counts(
     line = lines_of(rows)["BCQ over the expert: Push Right"]
     assert line["Met"] == met
     assert line["Asked"] == (
-        "90% of the distance to the scripted optimum (150%), as 185% is above it"
+        "90% of the distance to the scripted optimum (150%); the paper's 185% is above it"
     )
     bcq, expert, best = (returns(rows, a, "push_right").mean() for a in (BCQ, EXPERT, REFERENCE))
     part = (bcq - expert) / (best - expert)

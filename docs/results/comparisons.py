@@ -128,7 +128,7 @@ def differences_table(rows: Sequence[ResultRow], arms: Sequence[Arm]) -> Table:
     return Table(
         title="Difference to the expert, and probability of improvement",
         caption=(
-            "Relative difference: mean return of the policy less that of the expert, over that of "
+            "Relative difference: mean return of the policy minus that of the expert, over that of "
             "the expert. Both act from the same starts, so episodes are resampled in pairs, "
             "within each training seed. Probability of improvement P(X > Y): how often an episode "
             "of the policy returns more than an episode of the expert of the same seed, over all "

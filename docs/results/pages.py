@@ -136,7 +136,8 @@ def runs_sections(runs: Sequence[RunRow], *, baselines: bool, note: str = "") ->
         Section(
             heading="How to reproduce the runs",
             paragraphs=[
-                "These commands make the same runs, and then this page from their folders."
+                "These commands made the runs at the commits below, where presets may have other "
+                "values than today. The last ones write this page from the runs' folders."
                 + more * baselines
                 + note,
                 "\n".join(

@@ -108,9 +108,9 @@ def weak_targets_table(rows: Sequence[ResultRow], summaries: Sequence[Summary]) 
     return Table(
         title="Targets",
         caption=(
-            "BCQ over the expert: the target is the paper's ratio of the two returns. If the "
-            "scripted optimum does not reach this multiple of the expert's return, the target is a "
-            "share of the distance from the expert's return to the scripted optimum's, and the "
+            "BCQ over the expert: the target is the paper's ratio of the two returns. This ratio "
+            f"can be higher than the scripted optimum's. Then BCQ must cover {COVERED:.0%} of the "
+            "distance between the returns of the expert and of the scripted optimum, and the "
             "interval resamples the starts of all three policies. Success, and the distilled "
             "policy's share of BCQ's return: the value and the interval of the worst task. "
             "Distilled: one source of m for all tasks, the one whose worst share of BCQ's return "
@@ -164,7 +164,7 @@ def _gain_targets(rows: Sequence[ResultRow], task: str) -> list[Target]:
     if best is None or ratio <= 1 + best.value:
         return [target(what, f"at least {ratio:.0%}", share(gain), 1 + gain.value >= ratio)]
     asked = f"{COVERED:.0%} of the distance to the scripted optimum ({1 + best.value:.0%})"
-    asked += f", as {ratio:.0%} is above it"
+    asked += f"; the paper's {ratio:.0%} is above it"
     # Without a distance to cover, the target is the scripted optimum itself.
     if (part := covered(rows, BCQ, task)) is None:
         return [target(what, asked, share(gain), gain.value >= best.value)]
@@ -183,13 +183,13 @@ def _paired_targets(rows: Sequence[ResultRow], other: Arm) -> list[Target]:
     task, lowest = min(known.items(), key=lambda item: item[1].high)
     return [
         target(
-            f"BCQ less {name}: paired difference, mean over tasks",
+            f"BCQ minus {name}: paired difference, mean over tasks",
             "interval above 0",
             signed(mean),
             mean.low > 0.0,
         ),
         target(
-            f"BCQ less {name}: paired difference, lowest task",
+            f"BCQ minus {name}: paired difference, lowest task",
             "not significantly below 0",
             f"{signed(lowest)} ({task_name(task)})",
             lowest.high >= 0.0,

@@ -41,12 +41,12 @@ def returns_table(rows: Sequence[ResultRow], titles: dict[str, str]) -> Table:
 
 
 def stages_table(rows: Sequence[ResultRow], titles: dict[str, str]) -> Table:
-    """Both stages less every other algorithm, start by start."""
+    """Both stages minus every other algorithm, start by start."""
     stages = [arm for arm in (BCQ, best_source(rows)) if arm in arms_of(rows)]
     others = [name for name, _ in baselines_of(rows)]
     return replace(
         make_paired_table(rows, titles, policies=stages, references=others),
-        title="Both stages less each other algorithm",
+        title="Both stages minus each other algorithm",
         caption=(
             "As in the table above. Distilled: with the source of m of the targets. Intervals that "
             "contain 0 do not tell which policy returns more."
@@ -121,7 +121,7 @@ def agents_table(rows: Sequence[DiagnosticsRow]) -> Table:
             "Cells: spread ratio, value gap, outside share ([diagnostics.md](diagnostics.md)). "
             "Spread ratio: the spread of the candidates divided by that of the demonstrated "
             "actions; 1 if the generator models the demonstrations, near 0 if the policy clones "
-            "them. Value gap: the critics' value of the chosen action less that of the "
+            "them. Value gap: the critics' value of the chosen action minus that of the "
             "demonstrated one, in standard deviations of the latter. Outside share: share of the "
             "chosen actions that are farther from the candidates' mean than 99% of the "
             "demonstrated ones."

@@ -28,8 +28,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from statistics import mean, median
 
+import yaml
+
 ROOT = Path(__file__).resolve().parents[2]
 Values = dict[str, float]
+SHORTENED = (
+    "collect.valid_episodes",
+    "bcq.updates_per_epoch",
+    "bcq.eval_episodes",
+    "distill.updates",
+    "evaluate.episodes",
+)
 EVALUATED = (("bcq", ""), ("distilled", "prototype"))  # policies and sources of m
 
 IMPORT = """
@@ -130,12 +139,25 @@ def benchmark(tree: Path, name: str, *arguments: str) -> list[list[str]]:
     return [[cell.strip() for cell in row] for row in rows]
 
 
-def run(preset: str) -> Callable[[Path], Values]:
-    """Returns a row: a whole run of a preset."""
+def shortened(tree: Path, preset: str, part: float) -> list[str]:
+    """Returns settings for a part of a preset's demonstrations, updates and episodes."""
+    given = yaml.safe_load((tree / "recipes" / "config" / "preset" / f"{preset}.yaml").read_text())
+    numbers = {
+        f"collect.train_episodes.{k}": n for k, n in given["collect"]["train_episodes"].items()
+    }
+    for name in SHORTENED:
+        section, _, key = name.partition(".")
+        numbers[name] = given[section][key]
+    return [f"{name}={max(1, round(part * number))}" for name, number in numbers.items()]
+
+
+def run(preset: str, part: float = 1.0) -> Callable[[Path], Values]:
+    """Returns a row: a run of a preset, or of a part of it."""
 
     def row(tree: Path) -> Values:
         with tempfile.TemporaryDirectory() as folder:
             command = [sys.executable, "recipes/two_stage.py", f"preset={preset}"]
+            command += shortened(tree, preset, part) if part < 1 else []
             _, seconds, peak = measured([*command, f"run_dir={folder}/run"], tree)
             stages = json.loads(Path(folder, "run", "seconds.json").read_text())
             episodes = list(
@@ -210,8 +232,9 @@ ROWS: dict[str, Callable[[Path], Values]] = {
     "updates": updates,
     "quick": run("quick"),
     "paper": run("paper"),
+    "paper_tenth": run("paper", part=0.1),  # where whole ones take hours
 }
-LONG = ("quick", "paper")
+LONG = ("quick", "paper", "paper_tenth")
 
 
 @contextmanager

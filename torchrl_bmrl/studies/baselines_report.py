@@ -105,7 +105,7 @@ def make_paired_table(
     return Table(
         title="Differences on the same starts",
         caption=(
-            "Return of the policy less that of the reference from the same start, as a share of "
+            "Return of the policy minus that of the reference from the same start, as a share of "
             "the expert's mean return of the task, with a 95% interval: bootstrap over the pairs "
             "of episodes within each task and training seed. It is about these trained policies; "
             "another training may differ by more."
