@@ -281,7 +281,7 @@ def test_the_settings_of_stage_1_in_the_docs_are_those_of_the_presets(
     page = (RECIPES.parent / "docs" / "pipeline.md").read_text(encoding="utf-8")
     section = page.split("## Settings of stage 1\n")[1].split("\n## ")[0]
     found = re.findall(r"^\| `(\w+)\.(\w+)` \| `?([^|`]+?)`? \| `?([^|`]+?)`? \|", section, re.M)
-    assert len(found) == 13
+    assert len(found) == 14
     presets = [settings_of(f"preset={name}", f"run_dir={tmp_path}") for name in ("quick", "weak")]
     for group, name, *shown in found:
         for preset, text in zip(presets, shown, strict=True):

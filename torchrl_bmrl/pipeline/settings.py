@@ -70,15 +70,15 @@ class BCQSettings:
     """Stage 1: one Batch-Constrained Q-learning agent per task.
 
     Example:
-        >>> BCQSettings(epochs=2).updates_per_epoch
-        600
+        >>> BCQSettings(epochs=4).updates_per_epoch
+        800
     """
 
-    epochs: int = setting(4, above=0)  # the agents are evaluated after each
-    updates_per_epoch: int = setting(600, above=0)  # updates of each network
+    epochs: int = setting(2, above=0)  # the agents are evaluated after each
+    updates_per_epoch: int = setting(800, above=0)  # updates of each network
     eval_episodes: int = setting(2, at_least=0)  # after each epoch, for the curves; 0: no curves
-    batch_size: int = setting(100, above=0)  # transitions per update
-    lr: float = setting(1e-3, above=0)  # learning rate of Adam
+    batch_size: int = setting(128, above=0)  # transitions per update
+    lr: float = setting(3e-3, above=0)  # learning rate of Adam
     cosine: bool = True  # the learning rate decays to zero
     num_cells: list[int] = setting([256, 256], above=0)  # widths of the hidden layers
     generator: str = setting("autoencoder", choices=tuple(GENERATORS))  # model of the actions
@@ -127,13 +127,13 @@ class DistillSettings:
         'set'
     """
 
-    updates: int = setting(5000, above=0)  # number of updates
+    updates: int = setting(3000, above=0)  # number of updates
     # Further updates, of an encoder that tells the task from any behaviour (context_episodes).
     inference_updates: int = setting(0, at_least=0)
     # Before these, updates of models of each task's reward, which relabel its contexts; 0: none.
     reward_updates: int = setting(0, at_least=0)
-    batch_size: int = setting(48, above=0)  # transitions of each task per update
-    lr: float = setting(1e-3, above=0)  # learning rate of Adam
+    batch_size: int = setting(64, above=0)  # transitions of each task per update
+    lr: float = setting(3e-3, above=0)  # learning rate of Adam
     cosine: bool = True  # the learning rate decays to zero
     num_cells: list[int] = setting([256, 256], above=0)  # widths of the hidden layers
     task_encoder: str = setting("transition", choices=TASK_ENCODERS)  # input of the encoder
@@ -232,7 +232,7 @@ class Settings:
         >>> settings = Settings(tasks=["reach", "lift"], bcq=BCQSettings(epochs=2))
         >>> settings.check()
         >>> settings.distill.updates
-        5000
+        3000
     """
 
     preset: str = "quick"  # name of the preset
