@@ -139,6 +139,7 @@ def test_every_command_is_of_a_kind_that_a_test_or_the_checks_of_a_change_run() 
         "mypy",
         "lint-imports",
         "pre-commit",
+        "export",
         ".",
         "python3",
         "sphinx-build",

@@ -65,7 +65,7 @@ def test_the_differences_on_the_page_of_baselines_are_those_of_the_published_run
     assert (
         f"the differences are {shares['BC']} to BC, "
         f"{shares['BC, best episodes (share 0.5)']} to BC of the best episodes, "
-        f"{shares['IQL']} to IQL ({shares['IQL (expectile 0.5)']} to IQL with tuned coefficients"
+        f"{shares['IQL']} to IQL, {shares['IQL (expectile 0.5)']} to IQL with tuned coefficients"
     ) in text
     assert (
         f"{shares['TD3+BC (alpha 1)']} to TD3+BC and "

@@ -294,7 +294,7 @@ def test_sections_without_data_are_left_out(page: str) -> None:
         "How to reproduce the runs",
         "Everything measured",
     ]
-    assert "`recipes/train_bcq.py` needs the demonstrations" in page
+    assert "`recipes/train_bcq.py`, record its demonstrations once" in page
     rows = [row for row in make_weak_rows() if row.policy in ("expert", "bcq")]
     little = make_weak_page(Published().with_run(make_run("weak_paper"), rows, [])).text
     assert headings(little) == [
