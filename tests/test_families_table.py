@@ -272,7 +272,7 @@ def test_a_missing_or_damaged_file_is_named(runs: list[Path], edit: Edit, says: 
     ("seed", "settings", "study", "says"),
     [
         (0, {}, {}, r"again: seed is 0 as in .*run0; valid: another seed"),
-        (5, {"bcq": {"lr": 0.5}}, {}, r"again: bcq.lr is 0.5 here and 0.001 in .*run0"),
+        (5, {"bcq": {"lr": 0.5}}, {}, r"again: bcq.lr is 0.5 here and 0.003 in .*run0"),
         (5, {}, {"cloning_updates": 3}, "families.cloning_updates is 3 here and 2000 in"),
         (5, {"workers": 3, "stepper": "robosuite"}, {}, None),  # these change no result
     ],

@@ -142,7 +142,7 @@ def test_a_folder_that_was_not_given_is_compared_and_not_taken_over(
     monkeypatch.chdir(tmp_path)
     assert started(recipes, "collect", "bcq.lr=0.5")[0] == 0
     assert started(recipes, "collect") == (1, [])
-    assert "bcq.lr is 0.001 here and 0.5 in the folder's run" in capsys.readouterr().err
+    assert "bcq.lr is 0.003 here and 0.5 in the folder's run" in capsys.readouterr().err
     assert started(recipes, "collect", "run_dir=runs/collect-quick-seed0")[0] == 0
 
 
