@@ -1,7 +1,7 @@
 """Evaluates the policies from new starts and writes the report.
 
 python recipes/evaluate.py run_dir=runs/mine            # after recipes/distill.py
-python recipes/evaluate.py run_dir=runs/more base=runs/mine evaluate.episodes=50   # another number
+python recipes/evaluate.py run_dir=runs/more base=runs/mine evaluate.episodes=50  # more of them
 python recipes/evaluate.py evaluate.policy=recipes/policies/sawyer.safetensors  # no run needed
 """
 

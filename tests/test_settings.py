@@ -211,7 +211,7 @@ def test_presets_and_ablations_fill_valid_settings(recipes: Any, tmp_path: Path)
     from small_runs import RECIPES, configured, filled, settings_of
 
     presets, ablations = (
-        {path.stem: path for path in (RECIPES / "config" / group).glob("*.yaml")}
+        {path.stem: path for path in sorted((RECIPES / "config" / group).glob("*.yaml"))}
         for group in ("preset", "ablation")
     )
     assert len(presets) >= 5

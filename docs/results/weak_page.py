@@ -37,10 +37,9 @@ from torchrl_bmrl.reports.tables import Table
 from torchrl_bmrl.studies.baselines_report import make_paired_table
 
 NOTE = (
-    " Before the first line with `recipes/train_bcq.py`, record its demonstrations once: "
-    "`python recipes/collect.py preset=weak seed=1 'tasks=[\"lift\", \"push_right\"]' "
-    "run_dir=runs/weak`. Then add `base=runs/weak` to each of these lines, and a `run_dir` of its "
-    "own."
+    " Before the first line with `recipes/train_bcq.py`, record its demonstrations once: with "
+    "`recipes/collect.py`, the same preset, seed and tasks, and `run_dir=runs/weak`. Then add "
+    "`base=runs/weak` to each of these lines, and a `run_dir` of its own."
 )
 
 

@@ -14,7 +14,6 @@ share counts once.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import re
@@ -26,9 +25,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from statistics import mean, median
+from statistics import median
 
 import yaml
+
+from torchrl_bmrl.evaluation import read_results, summarise
 
 ROOT = Path(__file__).resolve().parents[2]
 Values = dict[str, float]
@@ -39,7 +40,6 @@ SHORTENED = (
     "distill.updates",
     "evaluate.episodes",
 )
-EVALUATED = (("bcq", ""), ("distilled", "prototype"))  # policies and sources of m
 
 IMPORT = """
 import sys, time
@@ -160,24 +160,23 @@ def run(preset: str, part: float = 1.0) -> Callable[[Path], Values]:
             command += shortened(tree, preset, part) if part < 1 else []
             _, seconds, peak = measured([*command, f"run_dir={folder}/run"], tree)
             stages = json.loads(Path(folder, "run", "seconds.json").read_text())
-            episodes = list(
-                csv.DictReader(Path(folder, "run", "results.csv").read_text().splitlines())
-            )
-        of: dict[tuple[str, str], list[dict[str, str]]] = {}
-        for episode in episodes:
-            if (episode["policy"], episode["latent_source"]) in EVALUATED:
-                of.setdefault((episode["task"], episode["policy"]), []).append(episode)
-        returns = {key: mean(float(each["return"]) for each in of[key]) for key in of}
-        successes = {key: mean(each["success"] == "1" for each in of[key]) for key in of}
-        tasks = sorted({task for task, _ in returns})
-        shares = [returns[task, "distilled"] / returns[task, "bcq"] for task in tasks]
+            rows = read_results(Path(folder, "run", "results.csv"))
+        of = {
+            (x.policy, x.task): x for x in summarise(rows) if x.latent_source in ("", "prototype")
+        }
+        of = {key: each for key, each in of.items() if key[0] in ("bcq", "distilled")}
+        returns = {key: each.mean_return for key, each in sorted(of.items())}
+        shares = [returns[key] / returns["bcq", key[1]] for key in returns if key[0] != "bcq"]
         return {
             f"{preset}: wall time [s]": seconds,
             **{f"{preset}: {stage} [s]": float(each) for stage, each in stages.items()},
             f"{preset}: peak memory of all processes [MB]": peak,
-            f"{preset}: lowest success [%]": 100 * min(successes.values()),
+            f"{preset}: lowest success [%]": 100 * min(x.success_rate or 0.0 for x in of.values()),
             f"{preset}: lowest distilled / BCQ": min(shares),
-            **{f"{preset}: return of {key[1]}, {key[0]}": returns[key] for key in sorted(returns)},
+            **{
+                f"{preset}: return of {policy}, {task}": returns[policy, task]
+                for policy, task in of
+            },
         }
 
     return row
