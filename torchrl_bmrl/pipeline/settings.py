@@ -71,11 +71,11 @@ class BCQSettings:
 
     Example:
         >>> BCQSettings(epochs=4).updates_per_epoch
-        800
+        600
     """
 
     epochs: int = setting(2, above=0)  # the agents are evaluated after each
-    updates_per_epoch: int = setting(800, above=0)  # updates of each network
+    updates_per_epoch: int = setting(600, above=0)  # updates of each network
     eval_episodes: int = setting(2, at_least=0)  # after each epoch, for the curves; 0: no curves
     batch_size: int = setting(128, above=0)  # transitions per update
     lr: float = setting(3e-3, above=0)  # learning rate of Adam
@@ -127,7 +127,7 @@ class DistillSettings:
         'set'
     """
 
-    updates: int = setting(3000, above=0)  # number of updates
+    updates: int = setting(2500, above=0)  # number of updates
     # Further updates, of an encoder that tells the task from any behaviour (context_episodes).
     inference_updates: int = setting(0, at_least=0)
     # Before these, updates of models of each task's reward, which relabel its contexts; 0: none.
