@@ -99,7 +99,8 @@ def test_clusters_that_equal_phases_give_one_whatever_their_names() -> None:
 
 
 def test_clusters_by_chance_give_about_nothing_however_many() -> None:
-    _, phase, episode = three_stages()
+    _, phase, _ = three_stages()
+    episode = np.zeros(len(phase), int)  # the intervals are not read
     rng = np.random.default_rng(0)
     for groups in (2, 3, 20):
         values = [
@@ -131,6 +132,27 @@ def test_the_interval_is_over_episodes_not_transitions() -> None:
     assert whole.value == apart.value
     assert whole.low < whole.value < whole.high
     assert whole.high - whole.low > 2 * (apart.high - apart.low)
+
+
+def test_an_interval_evaluates_each_combination_of_episodes_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    import sklearn.metrics
+
+    seen: list[tuple[int, ...]] = []
+    score = sklearn.metrics.adjusted_mutual_info_score
+
+    def record(phase: np.ndarray, stage: np.ndarray) -> float:
+        seen.append(tuple(stage.tolist()))
+        return float(score(phase, stage))
+
+    monkeypatch.setattr(sklearn.metrics, "adjusted_mutual_info_score", record)
+    # The groups are the episodes' numbers, so that they tell which were drawn.
+    episode = np.repeat([0, 1, 2], 4)
+    stage_agreement(episode, np.tile([0, 1, 0, 1], 3), episode)
+    # Ten combinations of three episodes, and all rows once more for the value.
+    assert len(seen) == 11
+    assert len(set(seen)) == 10
 
 
 # Distance to the goal

@@ -328,12 +328,17 @@ def _over_episodes(
     *,
     seed: int,
 ) -> Estimate:
-    """Evaluates a statistic of rows, with a percentile interval over resampled episodes."""
+    """Evaluates a statistic of rows, with a percentile interval over resampled episodes.
+
+    The statistic must not depend on the rows' order.
+    """
     groups = [np.flatnonzero(episode == number) for number in np.unique(episode)]
     rng = np.random.default_rng(seed)
-    draws = rng.integers(len(groups), size=(_RESAMPLES, len(groups)))
+    draws = np.sort(rng.integers(len(groups), size=(_RESAMPLES, len(groups))), axis=1)
+    # Few episodes have few combinations, which are drawn again and again.
+    draws, times = np.unique(draws, axis=0, return_counts=True)
     drawn = [statistic(np.concatenate([groups[i] for i in draw])) for draw in draws]
-    low, high = np.nanquantile(drawn, [0.025, 0.975])
+    low, high = np.nanquantile(np.repeat(drawn, times), [0.025, 0.975])
     value = statistic(np.arange(len(episode)))
     return Estimate(value=value, low=float(low), high=float(high))
 
