@@ -155,6 +155,20 @@ def test_an_interval_evaluates_each_combination_of_episodes_once(
     assert len(set(seen)) == 10
 
 
+def test_an_interval_counts_a_combination_as_often_as_it_is_drawn() -> None:
+    from sklearn.metrics import adjusted_mutual_info_score
+
+    _, phase, episode = three_stages()
+    stage = np.where(episode < 3, phase, 0)
+    drawn = []
+    for draw in np.random.default_rng(0).integers(6, size=(200, 6)):
+        rows = np.concatenate([np.flatnonzero(episode == number) for number in draw])
+        drawn.append(adjusted_mutual_info_score(phase[rows], stage[rows]))
+    measured = stage_agreement(stage, phase, episode, seed=0)
+    expected = np.quantile(drawn, [0.025, 0.975])
+    assert (measured.low, measured.high) == pytest.approx(tuple(expected))
+
+
 # Distance to the goal
 
 
