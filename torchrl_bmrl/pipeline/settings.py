@@ -232,7 +232,7 @@ class Settings:
         >>> settings = Settings(tasks=["reach", "lift"], bcq=BCQSettings(epochs=2))
         >>> settings.check()
         >>> settings.distill.updates
-        3000
+        2500
     """
 
     preset: str = "quick"  # name of the preset
