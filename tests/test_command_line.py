@@ -200,12 +200,12 @@ def test_every_preset_is_complete_and_valid(recipes: Any, tmp_path: Path, preset
     ]
 
 
-def test_the_presets_but_quick_keep_the_learning_rate_that_they_were_measured_with(
+def test_the_presets_but_quick_and_paper_keep_the_learning_rate_that_they_were_measured_with(
     recipes: Any, tmp_path: Path
 ) -> None:
     for preset in PRESETS:
         settings = settings_of(f"preset={preset}", f"run_dir={tmp_path}")
-        rate = 3e-3 if preset == "quick" else 1e-3
+        rate = 3e-3 if preset in ("quick", "paper") else 1e-3
         assert (settings.bcq.lr, settings.distill.lr) == (rate, rate), preset
 
 

@@ -263,8 +263,12 @@ def main() -> None:
         for name in options.rows:
             rounds: list[tuple[Values, Values]] = []
             for number in range(options.rounds):
-                rounds.append((ROWS[name](before), ROWS[name](ROOT)))
-                print(f"{name}, round {number}: {rounds[-1]}", file=sys.stderr, flush=True)
+                of: dict[Path, Values] = {}
+                # Each is first in every other round, so a machine that slows down favours neither.
+                for tree in (ROOT, before) if number % 2 == 0 else (before, ROOT):
+                    of[tree] = ROWS[name](tree)
+                    print(f"{name}, round {number}, {tree}: {of[tree]}", file=sys.stderr, flush=True)
+                rounds.append((of[before], of[ROOT]))
             for what in rounds[0][1]:
                 pairs = [(old[what], new[what]) for old, new in rounds if what in old]
                 old, new = ([pair[i] for pair in pairs] for i in range(2))
