@@ -267,7 +267,7 @@ def main() -> None:
                 # Each is first in every other round, so a machine that slows down favours neither.
                 for tree in (ROOT, before) if number % 2 == 0 else (before, ROOT):
                     of[tree] = ROWS[name](tree)
-                    print(f"{name}, round {number}, {tree}: {of[tree]}", file=sys.stderr, flush=True)
+                    print(name, number, tree, of[tree], file=sys.stderr, flush=True)
                 rounds.append((of[before], of[ROOT]))
             for what in rounds[0][1]:
                 pairs = [(old[what], new[what]) for old, new in rounds if what in old]
