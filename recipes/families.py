@@ -1,4 +1,4 @@
-"""Plays tasks that nobody trained on: held-out members of the run's family.
+"""Plays unseen tasks: held-out members of the run's family.
 
     python recipes/two_stage.py preset=family run_dir=runs/push
     python recipes/families.py run_dir=runs/push

@@ -195,7 +195,7 @@ def test_baselines_stand_beside_both_stages_under_their_names(page: str) -> None
     for name, policy in (("BCQ", "bcq"), ("BC", "bc")):
         seeds = {e.row.seed for e in published if e.row.policy == policy and e.preset == "paper"}
         assert lines[name]["Seeds"] == ", ".join(map(str, sorted(seeds)))
-    gains = {line["Policies"]: line for line in cells(page, "What the two stages buy")}
+    gains = {line["Policies"]: line for line in cells(page, "What each stage adds")}
     assert list(gains) == [
         "BCQ over Expert",
         "BCQ over BC",

@@ -192,7 +192,7 @@ def gains_table(rows: Sequence[ResultRow], pairs: Sequence[tuple[Arm, Arm]]) -> 
             name = f"{policy_name(x[0])} over {policy_name(y[0])}"
             lines.append((name, signed(mean), *ends, _probability(chance)))
     return Table(
-        title="What the two stages buy",
+        title="What each stage adds",
         caption=(
             "Relative difference of mean returns from the same starts, mean over tasks with its "
             "95% interval, and the tasks where it is lowest and highest; and the probability of "

@@ -136,10 +136,9 @@ def runs_sections(runs: Sequence[RunRow], *, baselines: bool, note: str = "") ->
         Section(
             heading="How to reproduce the runs",
             paragraphs=[
-                "These commands made the runs at the commits below, where presets may have other "
-                "values than today. The last ones write this page from the runs' folders."
-                + more * baselines
-                + note,
+                "These commands made the runs at the commits below, where presets may have "
+                "other values than today ([pipeline.md](pipeline.md)). The last ones write "
+                "this page from the runs' folders." + more * baselines + note,
                 "\n".join(
                     [
                         "```bash",

@@ -204,8 +204,8 @@ def _stages(rows: Sequence[ResultRow], summaries: Sequence[Summary]) -> Section:
                 EXPERT,
                 title="Policies and tasks",
                 caption=(
-                    "All learn from the same demonstrations. BC, TD3+BC, IQL and CQL are "
-                    "TorchRL's losses, one policy for each task as BCQ; BCQ with a one-hot task "
+                    "All learn from the same demonstrations. BC, TD3+BC and IQL are TorchRL's "
+                    "losses, with one policy per task as BCQ has; BCQ with a one-hot task "
                     "is one policy for all tasks, trained at once and told the task's index."
                 ),
             ),

@@ -137,5 +137,6 @@ def _short(rows: Sequence[ResultRow], targets: Table) -> list[str]:
     if targets.rows:
         missed = [what for what, _, _, met in targets.rows if met == "no"]
         met = f"{len(targets.rows) - len(missed)} of {len(targets.rows)} targets are met"
-        sentences.append(f"{met}; not met: {'; '.join(missed)}." if missed else f"{met}.")
+        short = "".join(f"\n- {each}" for each in missed)
+        sentences.append(f"{met}. Not met:\n{short}" if missed else f"{met}.")
     return [" ".join(sentences)] if sentences else []

@@ -66,7 +66,7 @@ class MetaDistillationLoss(KeyedLoss):
     :func:`~torchrl_bmrl.contrast.distance_error` and
     :func:`~torchrl_bmrl.contrast.contrastive_error`.
     An encoder of sets (:func:`~torchrl_bmrl.modules.make_context_encoder`) embeds groups of a
-    task's rows instead, for tasks that nobody trained on.
+    task's rows instead, for unseen tasks.
     :math:`\hat Q` is trained at :math:`\hat g` without a gradient into the student's generator.
 
     The teachers are frozen. Row i of the data belongs to task i. Teachers of equal shapes run as

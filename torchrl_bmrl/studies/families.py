@@ -1,4 +1,4 @@
-"""Tasks that nobody trained on: the distilled policy on held-out members of a family.
+"""Unseen tasks: the distilled policy on held-out members of a family.
 
 Every policy gets what it is allowed to know of a member: the parameter, one episode of an expert or
 of another behaviour, its own first episode, the nearest trained member, or nothing.
@@ -54,7 +54,7 @@ _COLUMNS: dict[str, Any] = {
     "data_return": or_nothing,
 }
 HEADINGS = {
-    "": "Tasks that nobody trained on",
+    "": "Unseen tasks",
     "_shares": "Shares of the return of others",
     "_differences": "What m is worth",
 }
