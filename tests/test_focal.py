@@ -13,6 +13,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl_bmrl import modules
 from torchrl_bmrl.behaviour import dual_kl, squashed_gaussian
 from torchrl_bmrl.modules import embed_context, extract_network
+from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.objectives import FOCALLoss
 from torchrl_bmrl.objectives.contexts import Embedded
 
@@ -165,6 +166,15 @@ def test_the_weight_of_the_divergence_follows_its_target_within_its_limits() -> 
     for divergence, weight in [(1.5, 1.2), (100.0, 2.0), (-100.0, 0.0)]:
         loss.adapt_divergence_weight(torch.tensor(divergence, dtype=torch.float64))
         assert loss.divergence_weight.item() == pytest.approx(weight)
+
+
+def test_an_encoder_that_reads_a_reward_under_its_old_name_is_refused() -> None:
+    """Although the data have both; critics and encoder would read different rewards."""
+    loss, data = make_focal_loss(), task_data(3, 6)
+    loss.set_keys(reward="scaled")
+    data["next", "scaled"] = 2 * data["next", "reward"]
+    with refused("reward='scaled'.* what task_encoder read"):
+        loss(data)
 
 
 @pytest.mark.parametrize("shape", [(6,), (1, 6), (2, 3, 6)])

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -146,7 +147,13 @@ BASE_FILES = {
             {"bcq": {"lr": 1.0}},
             {"data/reach.hdf5", "data/statistics.json", "evaluation/reach-expert.csv"},
         ),
+        (
+            {"evaluate": {"episodes": 1, "num_candidates": 7}},
+            {name for name in BASE_FILES if not name.startswith("evaluation/")}
+            - {"bcq/reach/evaluations.csv"},
+        ),
         ({"collect": {"noise": 0.0}}, set()),
+        ({"robot": "Panda"}, set()),
         ({"seed": 1}, set()),
         ({"tasks": ["reach"]}, set()),
     ],
@@ -188,6 +195,24 @@ def test_a_folder_of_an_earlier_version_has_the_defaults_of_settings_that_it_lac
             open_run(base, now | other, defaults)
     with pytest.raises(ConfigError, match=r"collect.speed is 1.0 here and None in"):
         open_run(base, now)
+
+
+@pytest.mark.parametrize(
+    ("section", "name", "first"), [("bcq", "cosine", False), ("distill", "advantage_weight", 0.0)]
+)
+def test_a_folder_without_a_setting_has_the_value_with_which_it_was_made(
+    tmp_path: Path, section: str, name: str, first: Any
+) -> None:
+    """Although the default is another one today."""
+    settings = pytest.importorskip("torchrl_bmrl.pipeline.settings", exc_type=ImportError)
+    defaults = asdict(settings.Settings())
+    assert defaults[section][name] != first
+    before = {key: value for key, value in defaults[section].items() if key != name}
+    open_run(tmp_path, SETTINGS | {section: before})
+    now = SETTINGS | {section: defaults[section]}
+    with pytest.raises(ConfigError, match=rf"{name} is .* here and {first} in the folder"):
+        open_run(tmp_path, now, defaults)
+    open_run(tmp_path, SETTINGS | {section: defaults[section] | {name: first}}, defaults)
 
 
 def test_a_run_that_was_killed_while_it_took_files_holds_no_others_when_it_goes_on(

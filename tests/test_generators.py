@@ -19,11 +19,18 @@ from helpers import (
     transitions,
 )
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.generators import ActionKeys
-from torchrl_bmrl.modules import BCQPolicy, make_latent_actor
+from torchrl_bmrl.modules import (
+    ActionVAE,
+    BCQPolicy,
+    PLASPolicy,
+    make_decoder,
+    make_latent_actor,
+)
 from torchrl_bmrl.objectives import BCQLoss, PLASLoss, StackedLoss
 from torchrl_bmrl.testing import Case, OfflineLossContract
 
@@ -101,6 +108,45 @@ def test_a_loss_over_a_flow_has_its_metrics_and_not_the_options_of_an_autoencode
         BMRLError, match=r"Flow has no encode\(\); valid: a generator with a latent"
     ):
         loss.encode(transitions(8))
+
+
+def test_a_policy_asks_the_generator_that_proposes_in_its_own_way() -> None:
+    """Also if it has a decoder, of which it does not draw N(0, I)."""
+
+    class Shifted(ActionVAE):
+        def propose(self, *args: Any, **options: Any) -> Any:
+            proposed = super().propose(*args, **options)
+            return proposed.set("action", torch.full_like(proposed["action"], 0.25))
+
+    loss = BCQLoss(Shifted(*DIMS).double(), make_critics(2), **BOUNDS)
+    for make in (BCQPolicy.frozen, BCQPolicy.live):
+        action = make(loss, num_candidates=3)(transitions(4).select("observation"))["action"]
+        assert torch.equal(action, torch.full_like(action, 0.25))
+
+
+def test_a_plas_policy_needs_only_what_its_loss_needs_of_a_generator() -> None:
+    class Latent(TensorDictModuleBase):
+        """The members that docs/generators.md lists, and no decoder."""
+
+        metrics, options, latent_dim = ("error",), (), 4
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.inner = make_decoder(*DIMS, 4).double()
+            self.in_keys, self.out_keys = ["observation"], ["action"]
+
+        def row_loss(self, tensordict: Any, keys: Any) -> Any: ...
+
+        def propose(self, observation: Any, num_candidates: int, keys: Any) -> Any: ...
+
+        def decode(self, tensordict: Any, keys: Any) -> Any:
+            return self.inner(tensordict)
+
+    actor = make_latent_actor(OBSERVATION_DIM, 4).double()
+    loss, state = PLASLoss(Latent(), actor, make_critics(2), **BOUNDS), transitions(4)
+    expected = loss.generator.inner(actor(state.select("observation")))["action"]
+    for make in (PLASPolicy.frozen, PLASPolicy.live):
+        assert torch.equal(make(loss)(state.select("observation"))["action"], expected)
 
 
 def test_a_generator_that_lacks_a_member_is_refused_by_name() -> None:

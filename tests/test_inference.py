@@ -68,6 +68,23 @@ def test_each_context_has_its_own_loss_without_a_reduction():
     assert loss(contexts())["loss_inference"].shape == (3, 4)
 
 
+def test_a_context_that_does_not_count_affects_no_number_and_no_gradient():
+    rows, counts = contexts(), torch.ones(3, 4, dtype=torch.bool)
+    counts[1, 2] = False
+    results = []
+    for value in (0.0, float("nan")):
+        data = rows.clone()
+        data["collector", "mask"] = counts
+        data["context", "observation"][1, 2] = value
+        loss = make_loss()
+        result = loss(data)
+        result["loss_inference"].backward()
+        gradient = torch.cat([p.grad.flatten() for p in loss.parameters() if p.grad is not None])
+        results.append((result["loss_inference"].detach(), result["accuracy"], gradient))
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+    assert results[0][2].any()
+
+
 def test_what_does_not_fit_is_refused():
     with pytest.raises(BMRLError, match="valid: an encoder of sets"):
         ContextInferenceLoss(make_task_encoder(3, 2), POINTS)

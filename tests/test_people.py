@@ -77,6 +77,18 @@ def test_an_error_at_the_start_leaves_no_file(
     assert not folder.exists()
 
 
+def test_recordings_of_a_sawyer_are_refused_beside_another_arm(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(people, "find_format", lambda path: "robosuite")
+    values = HumanSettings(path="demo.hdf5", task="lift")
+    with (
+        pytest.raises(BMRLError, match=r"robot is Panda and demo.hdf5 .*; valid: null or Sawyer"),
+        study_run(tmp_path / "run", robot="Panda") as run,
+    ):
+        learn_from_people(run, values)
+
+
 def test_the_verdict_on_human_data_follows_from_the_interval() -> None:
     def rows(share: float, gain: float, noise: float) -> list[dict[str, Any]]:
         return [

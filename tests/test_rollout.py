@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from typing import Any
 
 import pytest
 
@@ -10,8 +11,11 @@ pytest.importorskip("robosuite", exc_type=ImportError)
 pytest.importorskip("scipy")
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import RandomPolicy
 
 from torchrl_bmrl.envs.transforms import make_env
 from torchrl_bmrl.errors import BMRLError
@@ -92,6 +96,34 @@ def test_progress_counts_every_step_of_every_episode() -> None:
         evaluate_policy(env, Towards(), range(6), max_steps=4, report=steps.append)
     assert sum(steps) == 6 * 4
     assert max(steps) == 3
+
+
+def test_one_environment_whose_episodes_end_at_different_steps_is_refused() -> None:
+    """Its other episodes would be cut off with the first one."""
+
+    class Countdown(EnvBase):
+        """Episode i ends after its i + 1 steps."""
+
+        def __init__(self) -> None:
+            super().__init__(batch_size=[2])
+            self.observation_spec = Composite(observation=Unbounded((2, 1)), shape=[2])
+            self.action_spec = Bounded(-1, 1, (2, 1))
+            self.reward_spec = Unbounded((2, 1))
+
+        def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDict:
+            self.left = torch.tensor([[1], [3]])
+            return TensorDict({"observation": torch.zeros(2, 1)}, [2])
+
+        def _step(self, tensordict: TensorDictBase) -> TensorDict:
+            self.left = self.left - 1
+            after = {"observation": torch.zeros(2, 1), "reward": torch.ones(2, 1)}
+            return TensorDict(after | {"done": self.left <= 0}, [2])
+
+        def _set_seed(self, seed: int | None) -> None: ...
+
+    env = Countdown()
+    with pytest.raises(BMRLError, match=r"1 of 2 episodes of a Countdown ended after 1 steps"):
+        evaluate_policy(env, RandomPolicy(env.action_spec), [0, 1], max_steps=5)
 
 
 @pytest.mark.parametrize("seeds", [[1], [1, 2, 3]])

@@ -65,6 +65,12 @@ def test_a_run_that_is_not_open_refuses_work_and_writes_nothing(tmp_path: Path) 
         run.check_open()
 
 
+def test_a_task_may_be_named_run(tmp_path: Path) -> None:
+    """The name under which the whole run is locked is no task's."""
+    with make(tmp_path, tasks={"run": {"task": "lift"}}) as run:
+        assert run.names == ("run",)
+
+
 def test_a_run_can_be_opened_again_after_it_was_closed(tmp_path: Path) -> None:
     run = make(tmp_path)
     for _ in range(2):

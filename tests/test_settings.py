@@ -129,6 +129,18 @@ def leaves(settings: Any, prefix: str = "") -> list[tuple[str, Any, Any]]:
     return found
 
 
+@pytest.mark.parametrize(
+    "name", ["mixing_fraction", "metric_weight", "distance_weight", "contrastive_weight"]
+)
+def test_terms_that_compare_tasks_are_refused_before_anything_is_trained_for_one(name: str) -> None:
+    settings = Settings()
+    settings.check_distillation(["lift"])
+    setattr(settings.distill, name, 0.5)
+    settings.check_distillation(["lift", "reach"])
+    with pytest.raises(ConfigError, match=rf"distill.{name} is 0.5, and lift the only task"):
+        settings.check_distillation(["lift"])
+
+
 def test_the_defaults_are_valid() -> None:
     Settings().check()
 
@@ -167,6 +179,14 @@ def test_a_limit_of_each_setting_of_a_run_is_checked(name: str) -> None:
         ({"only": ["reach"], "bcq.stacked": True}, "only is .*; valid with bcq.stacked: null"),
         ({"bcq.value_bounds": (1.0, 0.0)}, "value_bounds are .*low < high"),
         ({"device": "gpu"}, "device is 'gpu'"),
+        (
+            {
+                "distill.task_encoder": "told",
+                "distill.isometry_weight": 0.0,
+                "distill.context": "previous",
+            },
+            "context is previous; valid .*told: set, current or random",
+        ),
     ],
 )
 def test_settings_that_do_not_fit_together_are_refused(changes: dict[str, Any], says: str) -> None:

@@ -122,8 +122,15 @@ def _pieces(
                 report(played * len(seeds) - reported)
                 reported = played * len(seeds)
             yield data
-            if options or data["next", "done"][..., -1, :].any():
+            ended = data["next", "done"][..., -1, :]
+            if options or ended.all():
                 return
+            if ended.any():
+                raise BMRLError(
+                    f"{int(ended.sum())} of {len(seeds)} episodes of a {type(env).__name__} ended "
+                    f"after {played} steps, before the others; valid: torchrl.envs.SerialEnv or "
+                    "ParallelEnv, which go on with the others"
+                )
             start = env.step_mdp(data[..., -1])
 
 

@@ -7,14 +7,14 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.functional import perturbed_action
-from torchrl_bmrl.generators import ActionKeys, check_bounds, decode_draws
+from torchrl_bmrl.generators import ActionKeys, LatentGenerator, check_bounds, decode_draws
 from torchrl_bmrl.modules.following import (
     LossPolicy,
     Made,
@@ -131,8 +131,10 @@ class BCQPolicy(LossPolicy):
             )
         student = "student_" * hasattr(loss, "student_generator")
         generator = link(loss, f"{student}generator", live)
-        # Acting needs no encoder.
-        part = getattr(generator.module, "decoder", generator.module)
+        part = generator.module
+        # Acting needs no encoder where proposals are decoded draws of N(0, I).
+        if getattr(type(part), "propose", _DECODES) is _DECODES:
+            part = getattr(part, "decoder", part)
         rule = getattr(loss, "acting_rule", "first")
         critic = link(loss, f"{student}qvalue_network", live, critic=rule)
         perturbation = None if student else link(loss, "perturbation_network", live, optional=True)
@@ -269,7 +271,7 @@ class PLASPolicy(LossPolicy):
         perturbation = link(loss, "perturbation_network", live, optional=True)
         policy = cls(
             actor.module,
-            generator.module.decoder,
+            getattr(generator.module, "decoder", None) or _Decoder(generator.module, loss),
             None if perturbation is None else perturbation.module,
             max_perturbation=as_number(loss.max_perturbation),
             bounds=(loss.action_low, loss.action_high),
@@ -288,6 +290,23 @@ class PLASPolicy(LossPolicy):
 
 
 # -- helpers ---------------------------------------------------------------------------------------
+
+_DECODES = LatentGenerator.propose
+
+
+class _Decoder(TensorDictModuleBase):
+    """The decoder of a generator that has only the method ``decode``."""
+
+    def __init__(self, generator: Any, loss: Any) -> None:
+        super().__init__()
+        self.generator, self.bounds = generator, getattr(generator, "bounds", None)
+        self.keys = ActionKeys(loss.tensor_keys.action, loss.tensor_keys.action_latent)
+        self.in_keys = [*generator.in_keys, self.keys.action_latent]
+        self.out_keys = [self.keys.action]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the action that is decoded from the latent."""
+        return self.generator.decode(tensordict, self.keys)
 
 
 def _latent_dim(generator: Any, given: int | None, key: NestedKey) -> Any:

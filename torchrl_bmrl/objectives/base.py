@@ -6,10 +6,10 @@ from collections.abc import Iterable
 from copy import deepcopy
 from dataclasses import asdict
 from math import inf
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams, unravel_key
+from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
@@ -17,11 +17,12 @@ from torchrl.objectives.common import LossModule
 from torchrl_bmrl.errors import BMRLError, UnknownNameError
 from torchrl_bmrl.functional import unpadded
 from torchrl_bmrl.objectives.checks import check_number, whole_signature
-from torchrl_bmrl.objectives.data import entry
+from torchrl_bmrl.objectives.data import entry, own_name
 from torchrl_bmrl.objectives.sizes import agreed_sizes, check_fit, is_lazy, parts_of
-from torchrl_bmrl.objectives.swap import Weights, holding, leaves, read, without_gradient
+from torchrl_bmrl.objectives.swap import Weights, holding, leaves, read, share_as, without_gradient
 
 REDUCTIONS = ("mean", "sum", "none")
+Self = TypeVar("Self", bound="KeyedLoss")
 
 
 class KeyedLoss(LossModule):
@@ -53,6 +54,8 @@ class KeyedLoss(LossModule):
 
     fixed_options: ClassVar[tuple[str, ...]] = ()
     """Options of the base that a subclass sets itself and does not accept."""
+    frozen_networks: ClassVar[tuple[str, ...]] = ()
+    """Networks that this loss never trains; they stay in evaluation mode."""
     separate_losses = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -175,18 +178,7 @@ class KeyedLoss(LossModule):
         copy = type(self).__new__(type(self))
         memo[id(self)] = copy
         copy.__dict__.update(deepcopy(self.__getstate__(), memo))
-        # Each TensorDictParams copies its own parameters, which would separate shared ones.
-        places: dict[int, list[tuple[str, NestedKey]]] = {}
-        for name, params in self.named_children():
-            if isinstance(params, TensorDictParams):
-                for key, leaf in params._param_td.items(True, True):
-                    places.setdefault(id(leaf), []).append((name, key))
-        for (first, key), *others in places.values():
-            for name, other in others:
-                held = copy._modules[name]
-                with held._param_td.unlock_():
-                    held._param_td.set(other, copy._modules[first]._param_td.get(key))
-                held._reset_params()
+        share_as(self, copy)
         return copy
 
     # -- keys ------------------------------------------------------------------------------------
@@ -270,21 +262,31 @@ class KeyedLoss(LossModule):
             raise BMRLError(self._left_behind)
 
     def readers(self, key: NestedKey) -> list[str]:
-        """Names of the networks that read a key, under ``"next"`` or not.
+        """Names of the networks that read a key, here, under ``"next"`` or in a context.
 
         Args:
             key: of an entry.
         """
-        if isinstance(key, tuple) and key[0] == "next":
-            key = unravel_key(key[1:])
-        networks = [(name, x) for name, x in vars(self).items() if isinstance(x, nn.Module)]
+        key = own_name(key)
         return [
             name
-            for name, network in networks
-            if any(key in getattr(part, "in_keys", ()) for part in parts_of(network))
+            for name, network in self._networks.items()
+            if any(key in map(own_name, getattr(x, "in_keys", ())) for x in parts_of(network))
         ]
 
     # -- networks ---------------------------------------------------------------------------------
+
+    @property
+    def _networks(self) -> dict[str, nn.Module]:
+        # TorchRL keeps them outside the modules of a loss, which have only their parameters.
+        return {name: x for name, x in vars(self).items() if isinstance(x, nn.Module)}
+
+    def train(self: Self, mode: bool = True) -> Self:
+        """Sets the mode of this loss and of its networks, for example of their dropout."""
+        super().train(mode)
+        for name, network in self._networks.items():
+            network.train(mode and name not in self.frozen_networks)
+        return self
 
     def check_sizes(self, name: str, network: Any) -> None:
         """Compares a new network's sizes with those of the networks that the loss already has.
@@ -296,8 +298,7 @@ class KeyedLoss(LossModule):
         Raises:
             BMRLError: if they do not fit together.
         """
-        others = [(key, x) for key, x in vars(self).items() if isinstance(x, nn.Module)]
-        check_fit(name, network, agreed_sizes([*others, (name, network)]))
+        check_fit(name, network, agreed_sizes([*self._networks.items(), (name, network)]))
         self._cold = self._cold or is_lazy(network)
 
     def weights(self, name: str, *, target: bool = False, frozen: bool = False) -> Weights:

@@ -24,6 +24,13 @@ def next_key(key: NestedKey) -> tuple[str, ...]:
     return ("next", key) if isinstance(key, str) else ("next", *key)
 
 
+def own_name(key: NestedKey) -> NestedKey:
+    """The name of an entry without its place, such as ``"next"``."""
+    while isinstance(key, tuple) and key[0] in ("next", "previous", "context"):
+        key = unravel_key(key[1:])
+    return key
+
+
 def readable(value: Tensor) -> bool:
     """Whether Python may read the numbers: on CPU, neither compiled nor under vmap."""
     return not (

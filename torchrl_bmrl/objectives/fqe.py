@@ -83,6 +83,7 @@ class FQELoss(OfflineLoss):
     """
 
     terms = ("qvalue",)
+    frozen_networks = ("policy",)
 
     policy: TensorDictModuleBase
     policy_params: TensorDictParams

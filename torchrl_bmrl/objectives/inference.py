@@ -12,13 +12,14 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_bmrl.context_keys import MASK
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.functional import average, nonzero_scale, unpadded
 from torchrl_bmrl.generators import written
 from torchrl_bmrl.objectives.base import KeyedLoss
 from torchrl_bmrl.objectives.checks import check_network
 from torchrl_bmrl.objectives.context_rows import context_keys
-from torchrl_bmrl.objectives.data import check_same_shape
+from torchrl_bmrl.objectives.data import check_same_shape, select
 
 
 class ContextInferenceLoss(KeyedLoss):
@@ -113,7 +114,7 @@ class ContextInferenceLoss(KeyedLoss):
                 "contexts of each task"
             )
         valid = self.valid_rows(tensordict, batch)
-        data = self.call("context_encoder", tensordict.select(*self.in_keys))
+        data = self.call("context_encoder", self._contexts(tensordict, valid))
         points = written(data, self.tensor_keys.task_latent, self.context_encoder)
         target = self.task_latents.unsqueeze(1)
         check_same_shape(self.tensor_keys.task_latent, target.expand(*batch, -1), points)
@@ -125,3 +126,12 @@ class ContextInferenceLoss(KeyedLoss):
         right = (nearest.view(batch) == own).to(points.dtype)
         losses = {"loss_inference": self.reduce(error, tensordict)}
         return TensorDict(losses | {"accuracy": average(right, valid)})
+
+    def _contexts(self, tensordict: TensorDictBase, valid: Tensor | None) -> TensorDictBase:
+        """What the encoder reads; contexts that do not count are full of zeros."""
+        batch = tensordict.batch_size
+        if valid is None:
+            return tensordict.select(*self.in_keys)
+        contexts = select(tensordict, self.in_keys, batch, valid, readers=self.readers)
+        present = contexts.get(MASK)
+        return contexts.set(MASK, present | ~valid.unsqueeze(-1))

@@ -103,6 +103,7 @@ class MBMLLoss(MetaDistillationLoss):
         reward_prediction: NestedKey = "reward_prediction"  # the reward models' output
 
     default_keys = _AcceptedKeys
+    frozen_networks = ("reward_models",)
     fixed_options = (
         "classification_weight",
         "metric_weight",
@@ -178,7 +179,7 @@ class MBMLLoss(MetaDistillationLoss):
         self.triplet_margin = check_number("triplet_margin", triplet_margin)
         self.max_deviation = check_number("max_deviation", max_deviation)
         check_network("reward_models", reward_models)
-        frozen = deepcopy(reward_models).requires_grad_(False)
+        frozen = deepcopy(reward_models).eval().requires_grad_(False)
         self.convert_to_functional(frozen, "reward_models", create_target_params=False)
         self.register_coefficients(triplet_weight=triplet_weight)
         self._in_keys = self._out_keys = None  # computed by the base without these parts

@@ -243,6 +243,12 @@ class StackedLoss(LossModule):
         self._template._apply(fn)
         return super()._apply(fn)
 
+    def train(self: Self, mode: bool = True) -> Self:
+        """Sets the mode of all members and of their networks."""
+        for loss in self._all():
+            loss.train(mode)
+        return super().train(mode)
+
     def member(self, index: int) -> LossModule:
         """One of the given losses, with its current parameters.
 

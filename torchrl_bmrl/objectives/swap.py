@@ -162,3 +162,30 @@ def _slots(module: nn.Module) -> list[tuple[dict[str, Tensor], str]]:
             paths.append(path)
         _SLOTS[module], _PATHS[module] = known, paths
     return known
+
+
+def share_as(loss: nn.Module, copy: nn.Module) -> None:
+    """Lets a copy of a loss share parameters between its networks as the original does.
+
+    Each ``TensorDictParams`` copies its own parameters, which separates shared ones.
+
+    Args:
+        loss: the original.
+        copy: changed in place.
+
+    Example:
+        >>> shared = TensorDictParams(TensorDict.from_module(nn.Linear(1, 1)))
+        >>> loss = nn.ModuleDict({"a": shared, "b": shared.copy()})
+        >>> share_as(loss, loss)
+    """
+    places: dict[int, list[tuple[str, NestedKey]]] = {}
+    for name, params in loss.named_children():
+        if isinstance(params, TensorDictParams):
+            for key, leaf in params._param_td.items(True, True):
+                places.setdefault(id(leaf), []).append((name, key))
+    for (first, key), *others in places.values():
+        for name, other in others:
+            held: Any = copy.get_submodule(name)
+            with held._param_td.unlock_():
+                held._param_td.set(other, copy.get_submodule(first)._param_td.get(key))  # type: ignore[union-attr]
+            held._reset_params()

@@ -104,7 +104,7 @@ class Run:
 
     def __enter__(self) -> Run:
         # Jobs that train only some tasks lock these, so that other jobs can train the rest.
-        parts = self.settings.only or ["run", *self.names]
+        parts = self.settings.only or ["_run", *self.names]  # no task can have this name
         settings, defaults = asdict(self.settings), asdict(Settings())
         with ExitStack() as opened:
             files = input_files(self.settings, self.tasks)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -118,6 +119,10 @@ class BCQSettings:
             raise ConfigError(f"bcq.action_chunk is {self.action_chunk}; valid for {where}: 1")
 
 
+OF_SEVERAL_TASKS = ("mixing_fraction", "metric_weight", "distance_weight", "contrastive_weight")
+"""Settings of stage 2 that compare tasks."""
+
+
 @dataclass
 class DistillSettings:
     """Stage 2: one student for all tasks.
@@ -193,6 +198,8 @@ class DistillSettings:
             needs["context"] = "another one, or an encoder of sets"
         if self.task_encoder in ("one_hot", "told", "nothing"):
             needs["isometry_weight"] = 0
+            if self.context == "previous":
+                needs["context"] = "set, current or random"
             if latent_sources != ["prototype"]:
                 raise ConfigError(
                     f"distill.task_encoder is {self.task_encoder}, which does not read "
@@ -289,6 +296,24 @@ class Settings:
             raise ConfigError(f"only is {self.only}; valid with bcq.stacked: null")
         if device:
             check_device(self.device)
+
+    def check_distillation(self, tasks: Sequence[str]) -> None:
+        """Checks that stage 2 can follow stage 1.
+
+        Args:
+            tasks: names of the run's tasks.
+
+        Raises:
+            ConfigError: for agents that propose chunks of actions, or terms that compare tasks if
+                there is only one.
+        """
+        self.bcq.check_single_actions("the distillation")
+        for name in OF_SEVERAL_TASKS:
+            if len(tasks) < 2 and (value := getattr(self.distill, name)):
+                raise ConfigError(
+                    f"distill.{name} is {value}, and {tasks[0]} the only task; valid: 0, or two "
+                    "tasks"
+                )
 
     def deciding(self) -> dict[str, Any]:
         """The settings that decide a run's result, by dotted names, for checkpoints."""

@@ -86,6 +86,7 @@ def train_job(job: tuple[Run, dict[str, str]], report: Report) -> bool:
         "batch_size": bcq.batch_size,
         "device": run.settings.device,
     }
+    torch.manual_seed(run.seed("batches", *agents))  # a buffer that prefetches draws from it
     if len(agents) == 1:
         buffer = make_replay_buffer(datasets[0], **options)
     else:

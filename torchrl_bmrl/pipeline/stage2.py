@@ -65,7 +65,8 @@ def stage2(run: Run, *, beside: Sequence[tuple[Callable[..., Any], Any]] = ()) -
             ``function((run, job), report)``; the student is trained in a worker, too, then.
 
     Raises:
-        ConfigError: for agents that propose chunks of actions.
+        ConfigError: for agents that propose chunks of actions, or terms that compare tasks if
+            there is only one.
         BMRLError: if an agent is missing, or the training diverges.
 
     Example:
@@ -75,7 +76,7 @@ def stage2(run: Run, *, beside: Sequence[tuple[Callable[..., Any], Any]] = ()) -
         ...
         torchrl_bmrl.errors.BMRLError: runs/mine is not open; valid: with Run(settings) as run: ...
     """
-    run.settings.bcq.check_single_actions("the distillation")
+    run.settings.check_distillation(run.names)
     run.jobs(
         _call,
         [(train_student, StudentJob(run.settings.distill, "distill")), *beside],
@@ -111,7 +112,7 @@ def advantage_scale(
 
     Args:
         teachers: one per task.
-        datasets: the states, ``[N_i]`` each; 512 of them are used.
+        datasets: the states, ``[N_i]`` each; 512 to 1023 of them are used.
         qvalue_scale: deviations that the values are divided by; ``None`` for 1.
 
     Returns:
@@ -208,6 +209,7 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
     )
     if distill.context == "previous":
         train = [with_previous(data, TRANSITION_KEYS) for data in train]
+    torch.manual_seed(run.seed("batches"))  # a buffer that prefetches draws from it
     sample = make_sampler(run, distill, train)
     if distill.mixing_fraction:
         warn_of_marks(train)
@@ -233,6 +235,7 @@ def train_student(job: tuple[Run, StudentJob], report: Report) -> None:
         else []
     )
     student.set_scales(*train, *others)
+    student.to(settings.device)  # its buffers, too; the loss would move its parameters alone
     normalisation = value_statistics(teachers, train) if distill.normalise_qvalue else (None, None)
     loss = make_distillation_loss(
         student,

@@ -56,7 +56,7 @@ def two_stage(run: Run) -> str:
         torchrl_bmrl.errors.BMRLError: runs/mine is not open; valid: with Run(settings) as run: ...
     """
     run.check_open()
-    run.settings.bcq.check_single_actions("the distillation")
+    run.settings.check_distillation(run.names)
     path = run.folder / "seconds.json"
     seconds = read_json(path, "the seconds of a run") if path.exists() else {}
     for name, stage in STAGES.items():

@@ -49,15 +49,18 @@ FREE_TO_CHANGE = (
 A study of a finished run compares its settings in its own folder. A preset or an ablation is a
 name for settings that are compared themselves.
 """
-_START = ("seed", "tasks", "collect")
+_START = ("seed", "tasks", "robot", "collect")
 ADOPTED: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("data/[!.]*.*", _START),
-    ("bcq/*/*.*", (*_START, "bcq")),
+    ("bcq/*/checkpoint*.*", (*_START, "bcq")),
+    ("bcq/*/*.*", (*_START, "bcq", "evaluate.num_candidates")),  # curves and diagnostics
     ("distill/*.*", (*_START, "bcq", "distill")),
     ("evaluation/*-expert.csv", (*_START, "evaluate")),
     ("evaluation/*-bcq.csv", (*_START, "bcq", "evaluate")),
 )
-"""Files that a run copies from its base, with the settings that they depend on."""
+"""Files that a run copies from its base, with the settings or sections that they depend on."""
+AT_FIRST: Mapping[str, Any] = {"bcq.cosine": False, "distill.advantage_weight": 0.0}
+"""What folders without a setting were made with, where this is not its default today."""
 PACKAGES = ("torchrl", "tensordict", "robosuite", "mujoco", "gymnasium", "numpy", "h5py")
 
 
@@ -83,7 +86,7 @@ def open_run(
         run_dir: the folder.
         settings: the resolved configuration.
         defaults: defaults of the settings. A setting that an earlier version did not have counts
-            as its default in that version's folders, since defaults keep their behaviour.
+            as its default in that version's folders, or as in :data:`AT_FIRST`.
         files: files that decide the results. Their digests are stored in ``inputs.json``.
 
     Raises:
@@ -226,12 +229,13 @@ def _settings_of(
 ) -> dict[str, Any]:
     """Deciding settings of a folder's run; those that its version did not have are the defaults."""
     before, usual = deciding(read_settings(run_dir)), deciding(defaults or {})
+    usual |= {key: AT_FIRST[key] for key in AT_FIRST if key in usual}
     return {key: usual[key] for key in now if key in usual and key not in before} | before
 
 
 def _section(named: Mapping[str, Any], section: str) -> dict[str, Any]:
-    """The settings of a section, by dotted names."""
-    return {key: x for key, x in named.items() if key.split(".")[0] == section}
+    """The settings of a section, or one setting, by dotted names."""
+    return {key: x for key, x in named.items() if f"{key}.".startswith(f"{section}.")}
 
 
 def other_setting(run_dir: Path, key: str, now: Any, before: Any) -> ConfigError:

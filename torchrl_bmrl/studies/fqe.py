@@ -177,7 +177,6 @@ def _evaluate(
         updates=settings.updates,
         gamma=bcq.gamma,
         tau=settings.tau,
-        lr=bcq.lr,
         batch_size=bcq.batch_size,
         num_cells=bcq.num_cells,
         device=run.settings.device,

@@ -78,6 +78,11 @@ def learn_from_people(run: Run, settings: HumanSettings) -> str:
         raise ConfigError("human.path is empty; valid: a file or folder with demonstrations")
     if settings.task not in run.names:
         raise UnknownNameError("human.task", settings.task, run.names)
+    if run.settings.robot not in (None, "Sawyer") and _is_raw(settings):
+        raise ConfigError(
+            f"robot is {run.settings.robot} and {settings.path} holds recordings of robosuite, "
+            "which are replayed by a Sawyer; valid: null or Sawyer"
+        )
     shares = [0.0, *(share for share in settings.shares if share)]
     agents = [(share, seed) for share in shares for seed in range(settings.training_seeds)]
     bcq, evaluate = run.settings.bcq, run.settings.evaluate
@@ -120,11 +125,15 @@ def learn_from_people(run: Run, settings: HumanSettings) -> str:
     return table.markdown()
 
 
+def _is_raw(settings: HumanSettings) -> bool:
+    return find_format(Path(settings.path)) == "robosuite"
+
+
 def _convert(settings: HumanSettings, path: Path) -> None:
     """Writes the human demonstrations in robomimic's layout, if the file is not there."""
     if path.exists():
         return
-    raw = find_format(Path(settings.path)) == "robosuite"
+    raw = _is_raw(settings)
     with progress(None, "converting", "episode") as bar:
 
         def report(episodes: int) -> None:

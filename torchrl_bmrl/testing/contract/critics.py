@@ -41,6 +41,8 @@ class EnsembleChecks:
         losses = run(loss, case.batch())
         assert not same(losses, run(plain, case.batch()))
         total(losses).backward()
+        assert same(run(loss.eval(), case.batch()), run(plain, case.batch())), "eval() has dropout"
+        assert same(run(loss.train(), case.batch()), losses), "train() has no dropout"
 
 
 class CriticChecks:
