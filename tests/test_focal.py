@@ -13,7 +13,6 @@ from torchrl.objectives import SoftUpdate
 from torchrl_bmrl import modules
 from torchrl_bmrl.behaviour import dual_kl, squashed_gaussian
 from torchrl_bmrl.modules import embed_context, extract_network
-from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.objectives import FOCALLoss
 from torchrl_bmrl.objectives.contexts import Embedded
 
