@@ -55,6 +55,13 @@ def test_rows_with_too_few_steps_left_are_dropped_unless_the_episode_terminates(
     assert data["next", "terminated"].flatten().tolist() == [0, 0, 1, 1, 1, 1, 1]
 
 
+@pytest.mark.parametrize("size", [1, 2])
+def test_padded_rows_are_no_chunks(size: int) -> None:
+    data = episodes(5)
+    data["mask"] = torch.tensor([True, True, True, False, False])
+    assert len(ActionChunks(size, gamma=0.5)(data)) == 4 - size
+
+
 def test_data_without_any_chunk_are_refused_by_the_size() -> None:
     with pytest.raises(BMRLError, match="size is 6, and the longest episode has 5 steps; valid"):
         ActionChunks(6, gamma=0.5)(episodes(5, 2))

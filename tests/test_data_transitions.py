@@ -10,6 +10,7 @@ from helpers import refused
 from tensordict import TensorDict
 
 from torchrl_bmrl.data import NStep, best_episodes, make_replay_buffer, with_next_action
+from torchrl_bmrl.errors import BMRLError
 
 
 def episodes(*lengths: int, terminated: tuple[int, ...] = (), rewards: Any = None) -> TensorDict:
@@ -124,6 +125,16 @@ def test_the_best_episodes_are_those_with_the_largest_returns_and_not_the_larges
     assert chosen(data, 1 / 3) == [2]
     assert chosen(data, 2 / 3) == [0, 2]
     assert best_episodes(data, 2 / 3)["action"].flatten().tolist() == [0, 1, 3, 4, 5]
+
+
+def test_episodes_of_two_data_sets_with_one_number_are_refused() -> None:
+    """Their returns would be added up."""
+    after = TensorDict({"reward": torch.ones(4, 1)}, [4])
+    steps = {"episode": torch.tensor([0, 0, 1, 1]), "step": torch.tensor([0, 1, 0, 1])}
+    data = TensorDict(steps | {"next": after}, [4])
+    assert len(best_episodes(data, share=0.5)) == 2
+    with pytest.raises(BMRLError, match=r"episode 0 has step 0 2 times; valid: .*number_episodes"):
+        best_episodes(torch.cat([data, data]))
 
 
 def test_at_least_one_episode_is_chosen_and_at_most_all() -> None:

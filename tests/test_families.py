@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("tqdm")
 from torchrl_bmrl.envs.hidden import HIDDEN, LiftToHeight, PushTowards, ReachAtSpeed, ReachHidden
@@ -30,6 +31,18 @@ def turning(**changes):
     members = {"train": [(0,), (90,)], "inside": [(45,)], "outside": [(120,)]}
     given = {"name": "turn", "parameters": ("angle",), "members": members, "make": turn}
     return Family(**(given | changes))
+
+
+def test_the_nearest_member_of_a_direction_may_lie_beyond_the_end_of_the_turn():
+    pytest.importorskip("robosuite", exc_type=ImportError)
+    from torchrl_bmrl.studies.families_methods import nearest_code
+
+    members = {"train": [(0,), (100,), (300,)], "inside": [(120,)], "outside": [(350,)]}
+    for period, expected in ((360.0, [1, 0]), (None, [1, 2])):
+        family = turning(members=members, period=period)
+        codes = torch.tensor([family.told(f"turn_{x}") for x in (0, 100, 300)])
+        held_out = [torch.tensor(family.told(f"turn_{x}")) for x in (120, 350)]
+        assert [nearest_code(codes, x, family.repeats) for x in held_out] == expected
 
 
 def test_the_four_families_of_the_sawyer_are_registered():

@@ -116,7 +116,7 @@ def test_runs_of_one_family_are_put_together(runs: list[Path]) -> None:
     assert row["Success"].endswith("%]")
     for table in found.values():
         assert "Training seeds: 0, 1, 2." in table.caption
-        assert "other training seeds and other members" in table.caption
+        assert "the variation over training seeds and members" in table.caption
         assert [row[:2] for row in table.rows] == [
             [split, METHODS[method]] for split in MEMBERS for method in SOME
         ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from episode_files import ENV_ARGS, assert_same, make_episode, write_file
 from torchrl_bmrl.data import Episode, lerobot, minari, robomimic
 from torchrl_bmrl.data.datasets import RobomimicExperienceReplay
 from torchrl_bmrl.data.importing import (
+    copy_scaled,
     find_action_bounds,
     import_demonstrations,
     read_original_bounds,
@@ -185,8 +187,49 @@ def test_a_file_that_was_imported_before_keeps_its_first_units(tmp_path: Path) -
     import_demonstrations(tmp_path / "own.hdf5", tmp_path / "one.hdf5")
     import_demonstrations(tmp_path / "one.hdf5", tmp_path / "two.hdf5")
     assert read_original_bounds(tmp_path / "two.hdf5") == (0.0, 4.0)
-    import_demonstrations(tmp_path / "one.hdf5", tmp_path / "three.hdf5", bounds=(-2, 1))
-    assert read_original_bounds(tmp_path / "three.hdf5") == (-2.0, 4.0)
+    for one, two in zip(read(tmp_path / "one.hdf5"), read(tmp_path / "two.hdf5"), strict=True):
+        assert_same(one, two)
+
+
+def test_bounds_are_in_the_units_before_any_import(tmp_path: Path) -> None:
+    """Such as those of an environment: they mean the same of a file that was imported."""
+    made = [in_units(make_episode(i), 0.0, 4.0) for i in range(2)]
+    robomimic.write_episodes(tmp_path / "own.hdf5", made, env_args={}, bounds=(0, 4))
+    import_demonstrations(tmp_path / "own.hdf5", tmp_path / "one.hdf5")
+    results = []
+    for source in ("own", "one"):
+        path = tmp_path / f"from_{source}.hdf5"
+        import_demonstrations(tmp_path / f"{source}.hdf5", path, bounds=(-4, 8))
+        assert read_original_bounds(path) == (-4.0, 8.0)
+        episode = read_scaled_episode(tmp_path / f"{source}.hdf5", bounds=(-4, 8))
+        results += [read(path)[0].actions, episode.actions]
+    assert find_action_bounds(tmp_path / "one.hdf5") == (0.0, 4.0)
+    for actions in results:
+        assert_allclose(actions, (made[0].actions - 2) / 6, atol=1e-6)
+
+
+def test_files_that_were_imported_from_other_bounds_get_common_units(tmp_path: Path) -> None:
+    made = {}
+    for name, end in (("narrow", 0.5), ("wide", 2.0), ("raw", 2.0)):
+        made[name] = [in_units(make_episode(i), -end, end) for i in range(2)]
+        source = tmp_path / f"{name}-own.hdf5"
+        robomimic.write_episodes(source, made[name], env_args={}, bounds=(-end, end))
+        if name == "raw":
+            source.rename(tmp_path / "raw.hdf5")
+        else:
+            import_demonstrations(source, tmp_path / f"{name}.hdf5")
+    import_demonstrations([tmp_path / f"{name}.hdf5" for name in made], tmp_path / "all.hdf5")
+    assert read_original_bounds(tmp_path / "all.hdf5") == (-2.0, 2.0)
+    written = read(tmp_path / "all.hdf5")
+    for episode, before in zip(written, chain.from_iterable(made.values()), strict=True):
+        assert_allclose(episode.actions, before.actions / 2, atol=1e-6)
+
+
+def test_a_copy_is_scaled_and_needs_no_second_episode(tmp_path: Path) -> None:
+    made = in_units(make_episode(0), -2.0, 2.0)
+    robomimic.write_episodes(tmp_path / "own.hdf5", [made], env_args={}, bounds=(-2, 2))
+    copy_scaled(tmp_path / "own.hdf5", tmp_path / "copy.hdf5", bounds=(-4, 4))
+    assert_allclose(read(tmp_path / "copy.hdf5")[0].actions, made.actions / 4, atol=1e-6)
 
 
 def test_a_range_that_leaves_the_usual_one_on_either_side_is_the_bounds(tmp_path: Path) -> None:
@@ -208,7 +251,13 @@ def test_bounds_of_other_sizes_are_not_joined() -> None:
 
 @pytest.mark.parametrize(
     ("count", "share", "valid"),
-    [(2, 0.1, [1]), (20, 0.1, [9, 19]), (15, 0.1, [6, 13]), (3, 0.9, [0, 1])],
+    [
+        (2, 0.1, [1]),
+        (20, 0.1, [9, 19]),
+        (15, 0.1, [6, 14]),
+        (20, 0.35, [1, 4, 7, 10, 13, 16, 19]),
+        (3, 0.9, [0, 2]),
+    ],
 )
 def test_episodes_are_held_out_at_equal_distances(
     tmp_path: Path, count: int, share: float, valid: list[int]
@@ -258,8 +307,8 @@ def test_episodes_of_another_behaviour_are_neither_trained_on_nor_held_out(tmp_p
         tmp_path / "own.hdf5", tmp_path / "lift.hdf5", valid_share=0.4, context=True
     )
     assert masks(tmp_path / "lift.hdf5") == {
-        "train": ["demo_0", "demo_3", "demo_6"],
-        "valid": ["demo_2", "demo_5"],
+        "train": ["demo_0", "demo_3", "demo_5"],
+        "valid": ["demo_2", "demo_6"],
         "context": ["demo_1", "demo_4", "demo_7"],
     }
 
@@ -338,7 +387,7 @@ def test_what_is_left_out_or_changed_is_logged(
     assert all(note in caplog.text for note in done.notes)
     assert "left out: 2 last steps" in caplog.text
     assert "actions were scaled from" in caplog.text
-    assert "2 episodes to train on, 1 held out (one in every 3)" in caplog.text
+    assert "2 episodes to train on, 1 held out (1 of 3, evenly spread)" in caplog.text
 
 
 # -- options from a mapping ------------------------------------------------------------------------

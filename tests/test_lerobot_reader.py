@@ -63,7 +63,8 @@ def test_what_a_set_says_of_itself_is_read_and_contradictions_are_named(
     # The episodes have several tasks, so that the set states none.
     assert read_metadata(path) == {"dataset_id": "set", "fps": FPS}
     pictures = "pictures are not read: observation.images.top, observation.images.wrist"
-    assert find_oddities(path) == [pictures]
+    tasks = "2 tasks are read as one: 'task 0', 'task 1'"
+    assert find_oddities(path) == [tasks, pictures]
     edit_info(path, total_frames=16)
     assert "total_frames is 16, but there are 15" in find_oddities(path)[0]
 

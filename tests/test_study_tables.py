@@ -88,7 +88,7 @@ def test_switching_tells_arriving_from_staying_and_counts_arrivals_before_the_sw
     played = {"stay": episodes, "switch": episodes | {"eef": moved}}
     stay, switch = interpolation_report.switching_table("Reach", played, 20.0).rows
     assert [cell.split()[0] for cell in stay[2:4]] == ["0.67", "0.33"]
-    assert list(stay[4:]) == ["1", "0.10", "0.0000"]
+    assert list(stay[4:]) == ["1", "0.15", "0.0000"]
     assert switch[-1] == "0.3000"
 
 

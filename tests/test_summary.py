@@ -207,8 +207,17 @@ def test_saturated_actions_deserve_a_look() -> None:
 
     episodes = [make_episode(i, 10) for i in range(2)]
     assert warnings_of([saturate(e, 5) for e in episodes]) == []
-    expected = "actions: dimension 6 is at ±1 in 60% of all steps"
-    assert warnings_of([saturate(e, 6) for e in episodes]) == [expected]
+    expected = "actions: dimension 6 is at a bound in 60% of all steps"
+    saturated = [saturate(e, 6) for e in episodes]
+    assert warnings_of(saturated) == [expected]
+    # In other units, too; and what is at 1 of 2 is at no bound.
+    low, high = [-2.0] * 7, [1.0] * 6 + [4.0]
+    scaled = [
+        replace(e, actions=(np.add(high, low) + e.actions * np.subtract(high, low)) / 2)
+        for e in saturated
+    ]
+    assert warnings_of(scaled, bounds=(low, high)) == [expected]
+    assert warnings_of(saturated, bounds=(-2, 2)) == []
 
 
 def test_discrete_actions_do_not_saturate() -> None:

@@ -128,6 +128,14 @@ class Family:
             raise UnknownNameError(f"member of family {self.name}", task, tuple(self.by_name))
         return self.by_name[task]
 
+    @property
+    def repeats(self) -> tuple[float, ...] | None:
+        """After which each number of :meth:`told` means the same again; ``None``: never."""
+        if self.period is None or self.code is not None:
+            return None
+        columns = zip(*self.members["train"], strict=True)
+        return tuple(2 * self.period / ((max(x) - min(x)) or 1) for x in columns)
+
     def told(self, task: str) -> tuple[float, ...]:
         """Numbers that a policy is given which is told a member's parameter.
 

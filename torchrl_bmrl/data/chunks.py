@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from torchrl_bmrl.data.n_step import STEPS_KEY, NStep, rows_later
+from torchrl_bmrl.data.n_step import MASK_KEYS, STEPS_KEY, NStep, rows_later
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.objectives.data import missing
 
@@ -74,6 +74,9 @@ class ActionChunks(nn.Module):
         steps: Tensor = data.get(STEPS_KEY)[..., 0]
         parts = [action[rows_later(steps.clamp(max=i + 1) - 1)] for i in range(size)]
         whole = steps == size
+        for key in MASK_KEYS:
+            if (mask := data.get(key, None)) is not None:
+                whole = whole & mask.reshape(whole.shape)
         if (terminated := data.get(self.outcome.terminated_key, None)) is not None:
             whole = whole | terminated[..., 0]
         if not whole.any():

@@ -5,23 +5,21 @@ from __future__ import annotations
 import json
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchrl_bmrl.data import robomimic
 from torchrl_bmrl.data.convert import Conversion, Stream, writing
-from torchrl_bmrl.data.episodes import Episode
+from torchrl_bmrl.data.episodes import Episode, LazyEpisodes
 from torchrl_bmrl.data.options import Bounds, ReadOptions, check_bounds, join_bounds
 from torchrl_bmrl.data.robomimic_file import CONTEXT_MASK, MASKS
-from torchrl_bmrl.data.sources import (
-    Source,
-    open_sources,
-    range_of_actions,
-    with_bounds,
-)
+from torchrl_bmrl.data.schema import check_episode
+from torchrl_bmrl.data.sources import Source, open_sources, range_of_actions
 from torchrl_bmrl.errors import ConfigError, DataError
 from torchrl_bmrl.files import parse_json
 
@@ -38,18 +36,15 @@ def import_demonstrations(
     target: str | os.PathLike[str],
     *,
     options: ReadOptions | None = None,
-    task: str | None = None,
-    tracking: float = 1.0,
     valid_share: float = 0.1,
     context: bool = False,
     bounds: Bounds | None = None,
-    report: Callable[[int], object] = lambda _: None,
 ) -> Conversion:
     """Writes a user's demonstrations into one file in robomimic's layout, ready for training.
 
     Actions are scaled to [-1, 1]. Two masks tell the episodes to train on (``train``) from those
-    that are held out (``valid``): the sources' own, if every source has both. Otherwise, every k-th
-    episode is held out, of those outside a mask ``context`` of another behaviour's episodes.
+    that are held out (``valid``): the sources' own, if every source has both. Otherwise,
+    episodes that are evenly spread are held out, of those outside a mask ``context``.
     Observations, rewards, terminations, successes, other arrays and attributes are copied. Notes on
     what was changed or left out are logged.
 
@@ -59,14 +54,11 @@ def import_demonstrations(
             list of such paths. Several become one.
         target: the new HDF5 file.
         options: how the source is read; the defaults if ``None``.
-        task: the task in whose scene a robosuite ``demo.hdf5`` was recorded.
-        tracking: see :func:`torchrl_bmrl.data.robosuite.open_episodes`.
         valid_share: share of the episodes to hold out, of which there is at least one.
         context: whether every source needs a mask ``context``.
-        bounds: lowest and highest action, which become -1 and 1; those of
-            :func:`find_action_bounds` if ``None``. The file stores them, see
+        bounds: lowest and highest action, which become -1 and 1, in the units of the actions before
+            any import; those of :func:`find_action_bounds` if ``None``. The file stores them, see
             :func:`read_original_bounds`.
-        report: called with 1 after every episode.
 
     Returns:
         what was read, and notes on what was changed or left out.
@@ -105,28 +97,14 @@ def import_demonstrations(
     """
     if isinstance(valid_share, bool) or not 0 < valid_share < 1:
         raise ConfigError(f"valid_share is {valid_share!r}; valid: a number between 0 and 1")
-    chosen = None if bounds is None else check_bounds(bounds)
     target = Path(target).expanduser()
-    reading = vars(options or ReadOptions())
-    with open_sources(_expand(source), task=task, tracking=tracking, **reading) as sources:
-        _check_actions(sources)
-        bounds = chosen or _bounds_of(sources)
-        stream = Stream(with_bounds(sources, bounds), report)
+    with _open_scaled(source, options, bounds) as (stream, bounds):
         for opened in stream.sources if context else ():
             if not opened.metadata.get("masks", {}).get(CONTEXT_MASK):
                 message = "names no episode; valid: the episodes of another behaviour"
                 raise DataError(opened.path, f"mask/{CONTEXT_MASK}", message)
         masks, how = _masks(stream, valid_share)
-        original = _original_bounds(stream, bounds)
-        with writing(target):
-            robomimic.write_episodes(
-                target,
-                (_scaled(episode, bounds) for episode in stream),
-                env_args=stream.metadata["env_args"],
-                attributes=stream.attributes_of_file
-                | {ORIGINAL_BOUNDS: json.dumps({"low": original[0], "high": original[1]})},
-                masks=masks,
-            )
+        _write(target, stream, bounds, masks)
         notes = [*stream.notes("robomimic")]
     if bounds != (-1.0, 1.0):
         notes.append(f"actions were scaled from {bounds[0]} to {bounds[1]} to [-1, 1]")
@@ -135,6 +113,35 @@ def import_demonstrations(
     for note in notes:
         log.info("%s: %s", target, note)
     return Conversion(account=stream.account, notes=tuple(notes))
+
+
+def copy_scaled(
+    source: Paths,
+    target: str | os.PathLike[str],
+    *,
+    bounds: Bounds,
+    report: Callable[[int], object] = lambda _: None,
+) -> Conversion:
+    """Writes demonstrations as :func:`import_demonstrations` does, without masks of its own.
+
+    Args:
+        source: as for :func:`import_demonstrations`.
+        target: the new HDF5 file.
+        bounds: as for :func:`import_demonstrations`.
+        report: called with 1 after every episode.
+
+    Raises:
+        DataError: as :func:`import_demonstrations`; one episode is enough.
+
+    Example:
+        >>> copy_scaled("nowhere.hdf5", "copy.hdf5", bounds=(-2.0, 2.0))
+        Traceback (most recent call last):
+        ...
+        torchrl_bmrl.errors.DataError: nowhere.hdf5: no such file
+    """
+    with _open_scaled(source, None, bounds, report) as (stream, bounds):
+        _write(Path(target).expanduser(), stream, bounds, stream.metadata["masks"])
+        return Conversion(account=stream.account, notes=tuple(stream.notes("robomimic")))
 
 
 def read_scaled_episode(
@@ -151,8 +158,9 @@ def read_scaled_episode(
         source: as for :func:`import_demonstrations`.
         index: number of the episode, from 0.
         options: how the source is read; the defaults if ``None``.
-        bounds: lowest and highest action, which become -1 and 1: those of the data that a policy
-            was trained on (:func:`read_original_bounds`); of the source itself if ``None``.
+        bounds: lowest and highest action, which become -1 and 1, in the units of the actions before
+            any import: those of the data that a policy was trained on
+            (:func:`read_original_bounds`); of the source itself if ``None``.
         context: count the episodes in the mask ``context``, of another behaviour, instead of those
             outside it.
 
@@ -176,24 +184,17 @@ def read_scaled_episode(
         >>> read_scaled_episode(path, bounds=(-0.5, 0.5)).actions.tolist()
         [[0.5], [0.5]]
     """
-    chosen = None if bounds is None else check_bounds(bounds)
-    reading = vars(options or ReadOptions())
-    with open_sources(_expand(source), **reading) as sources:
-        _check_actions(sources)
-        bounds = chosen or _bounds_of(sources)
-        stream = Stream(with_bounds(sources, bounds))
+    with _open_scaled(source, options, bounds) as (stream, _):
         others = set(stream.metadata["masks"].get(CONTEXT_MASK, ()))
         left = index
         for i, episode in enumerate(stream):
             if (i in others) != context:
                 continue
             if not left:
-                return _scaled(episode, bounds)
+                return episode
             left -= 1
-        where = ("outside", "in")[context]
-        message = (
-            f"{index - left} episodes {where} mask/{CONTEXT_MASK}; valid: at least {index + 1}"
-        )
+        where = f"{('outside', 'in')[context]} mask/{CONTEXT_MASK}"
+        message = f"{index - left} episodes {where}; valid: at least {index + 1}"
         raise DataError(stream.sources[0].path, None, message)
 
 
@@ -201,10 +202,8 @@ def find_action_bounds(
     source: Paths,
     *,
     options: ReadOptions | None = None,
-    task: str | None = None,
-    tracking: float = 1.0,
 ) -> Bounds:
-    """Lowest and highest action of the demonstrations of one task.
+    """Lowest and highest action of the demonstrations of one task, in the units before any import.
 
     They are those of ``options.bounds``, else those that the file states, else [-1, 1] if all
     actions lie in that range, else each dimension's smallest and largest action. Several sources
@@ -214,8 +213,6 @@ def find_action_bounds(
     Args:
         source: as for :func:`import_demonstrations`.
         options: how the source is read; the defaults if ``None``.
-        task: as for :func:`import_demonstrations`.
-        tracking: as for :func:`import_demonstrations`.
 
     Returns:
         lowest and highest action: a number for all dimensions or a tuple with one for each.
@@ -241,8 +238,7 @@ def find_action_bounds(
         >>> find_action_bounds(path, options=ReadOptions(bounds="data"))
         ((-2.0, 1.0), (3.0, 4.0))
     """
-    reading = vars(options or ReadOptions())
-    with open_sources(_expand(source), task=task, tracking=tracking, **reading) as sources:
+    with open_sources(_expand(source), **vars(options or ReadOptions())) as sources:
         _check_actions(sources)
         return _bounds_of(sources)
 
@@ -289,6 +285,35 @@ def _parse(path: str | Path, text: object) -> Bounds | None:
         raise DataError(path, "data", message) from error
 
 
+@contextmanager
+def _open_scaled(
+    source: Paths,
+    options: ReadOptions | None,
+    bounds: Bounds | None,
+    report: Callable[[int], object] = lambda _: None,
+) -> Iterator[tuple[Stream, Bounds]]:
+    """All episodes of a source with actions in [-1, 1], and the bounds that they had."""
+    chosen = None if bounds is None else check_bounds(bounds)
+    with open_sources(_expand(source), **vars(options or ReadOptions())) as sources:
+        _check_actions(sources)
+        bounds = chosen or _bounds_of(sources)
+        yield Stream([_in_bounds(each, bounds) for each in sources], report), bounds
+
+
+def _write(
+    target: Path, stream: Stream, bounds: Bounds, masks: Mapping[str, Sequence[int]]
+) -> None:
+    original = {ORIGINAL_BOUNDS: json.dumps({"low": bounds[0], "high": bounds[1]})}
+    with writing(target):
+        robomimic.write_episodes(
+            target,
+            stream,
+            env_args=stream.metadata["env_args"],
+            attributes=stream.attributes_of_file | original,
+            masks=masks,
+        )
+
+
 def _expand(source: Paths) -> Sequence[str | os.PathLike[str]]:
     """The paths of a source; those of its HDF5 files for a folder that is not a data set."""
     paths: list[str | os.PathLike[str]] = []
@@ -317,30 +342,41 @@ def _bounds_of(sources: Sequence[Source]) -> Bounds:
 
 
 def _bounds_of_one(source: Source) -> Bounds:
-    if source.bounds_stated:
-        return source.bounds
-    found = range_of_actions(source.episodes, source.episodes)
-    within = np.min(found[0]) >= -1 and np.max(found[1]) <= 1
-    return (-1.0, 1.0) if within else found
-
-
-def _scaled(episode: Episode, bounds: Bounds) -> Episode:
-    """The episode with actions in [-1, 1]."""
-    if bounds == (-1.0, 1.0):
-        return episode
-    low, high = (np.asarray(bound, dtype=np.float64) for bound in bounds)
-    actions = np.clip(2 * (episode.actions - low) / (high - low) - 1, -1, 1)
-    return replace(episode, actions=actions.astype(episode.actions.dtype))
-
-
-def _original_bounds(stream: Stream, bounds: Bounds) -> Bounds:
-    """The bounds in the units of the first file, if the source was scaled before."""
-    stated = stream.attributes_of_file.get(ORIGINAL_BOUNDS)
-    before = _parse(stream.sources[0].path, stated)
+    bounds = source.bounds
+    if not source.bounds_stated:
+        found = range_of_actions(source.episodes, source.episodes)
+        within = np.min(found[0]) >= -1 and np.max(found[1]) <= 1
+        bounds = (-1.0, 1.0) if within else found
+    before = _before(source)
     if before is None:
         return bounds
-    low, high = (np.asarray(bound) for bound in before)
+    low, high = before
     return check_bounds(tuple(low + (np.asarray(bound) + 1) / 2 * (high - low) for bound in bounds))
+
+
+def _before(source: Source) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """The bounds that -1 and 1 had before the source was imported; ``None`` if it was not."""
+    found = _parse(source.path, source.metadata.get(ORIGINAL_BOUNDS))
+    return None if found is None else (np.asarray(found[0]), np.asarray(found[1]))
+
+
+def _in_bounds(source: Source, bounds: Bounds) -> Source:
+    """The source with actions in [-1, 1], of which these are the bounds before any import."""
+    low, high = (np.asarray(bound, dtype=np.float64) for bound in bounds)
+    if (before := _before(source)) is not None:
+        low, high = (2 * (x - before[0]) / (before[1] - before[0]) - 1 for x in (low, high))
+    own = check_bounds((low, high))
+
+    def scaled(name: str) -> Episode:
+        episode = source.episodes[name]
+        check_episode(source.path, f"{source.prefix}{name}", episode, bounds=own)
+        actions = np.clip(2 * (episode.actions - low) / (high - low) - 1, -1, 1)
+        return replace(episode, actions=actions.astype(episode.actions.dtype))
+
+    kept = {k: x for k, x in source.metadata.items() if k not in ("action_bounds", ORIGINAL_BOUNDS)}
+    changes = np.any(low != -1) or np.any(high != 1)
+    episodes = LazyEpisodes(source.episodes, scaled) if changes else source.episodes
+    return replace(source, bounds=(-1.0, 1.0), metadata=kept, episodes=episodes)
 
 
 def _masks(stream: Stream, valid_share: float) -> tuple[dict[str, Sequence[int]], str]:
@@ -358,7 +394,8 @@ def _masks(stream: Stream, valid_share: float) -> tuple[dict[str, Sequence[int]]
     if stated:
         return masks, "by the masks of the source"
     held_out = min(len(own) - 1, max(1, round(valid_share * len(own))))
-    step = len(own) // held_out
-    valid = own[step - 1 :: step][:held_out]
-    train = [i for i in own if i not in valid]
-    return masks | {"train": train, "valid": valid}, f"one in every {step}"
+    # Spread over all of them: files that are joined may be of different kinds.
+    chosen = {(k + 1) * len(own) // held_out - 1 for k in range(held_out)}
+    valid = [i for position, i in enumerate(own) if position in chosen]
+    train = [i for position, i in enumerate(own) if position not in chosen]
+    return masks | {"train": train, "valid": valid}, f"{held_out} of {len(own)}, evenly spread"

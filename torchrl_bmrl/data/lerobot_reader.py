@@ -83,6 +83,10 @@ def _oddities(layout: Layout) -> Iterator[str]:
         said = layout.info.get(key)
         if said is not None and said != found:
             yield f"meta/info.json: {key} is {said}, but there are {found}"
+    tasks = sorted({str(rows.task) for rows in layout.episodes.values() if rows.task})
+    if len(tasks) > 1:
+        more = ", ..." if len(tasks) > 3 else ""
+        yield f"{len(tasks)} tasks are read as one: {', '.join(map(repr, tasks[:3]))}{more}"
     videos = [
         key
         for key, feature in layout.info["features"].items()

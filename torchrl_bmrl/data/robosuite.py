@@ -279,7 +279,7 @@ def _observe(env: TabletopScene, states: np.ndarray) -> tuple[dict[str, np.ndarr
 
 
 def _recorded_path(
-    recording: Recording, env: TabletopScene, there: _Scene, here: _Scene, rows: np.ndarray
+    env: TabletopScene, there: _Scene, here: _Scene, rows: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The end-effector's path (N, 3) [m] by the recording's model, and rotations (N, 3, 3).
 
@@ -305,7 +305,7 @@ def _relabel(recording: Recording, env: TabletopScene, tracking: float) -> Episo
     rows = resample(recording, env.control_freq)
     states, here = _transfer(recording, env, there, rows)
     parts, (rotations, rewards, successes) = _observe(env, states)
-    path, hands = _recorded_path(recording, env, there, here, rows)
+    path, hands = _recorded_path(env, there, here, rows)
     apart = np.linalg.norm(path - parts["robot0_eef_pos"], axis=1)
     if apart.max() > MAX_MODEL_ERROR:
         raise recording.error(

@@ -27,7 +27,7 @@ class Extent:
         dtype: as text.
         low: smallest of each element.
         high: largest of each element.
-        saturated: number of rows in which each element is at ±1.
+        saturated: number of rows in which each element is at a bound.
     """
 
     dtype: str
@@ -36,10 +36,14 @@ class Extent:
     saturated: np.ndarray
 
     @classmethod
-    def of(cls, array: np.ndarray) -> Extent:
-        """Range of one episode's array."""
-        saturated = (np.abs(array) >= SATURATED).sum(0)
-        return cls(str(array.dtype), array.min(0), array.max(0), saturated)
+    def of(cls, array: np.ndarray, bounds: Bounds | None = None) -> Extent:
+        """Range of one episode's array, and how often it is at its bounds."""
+        low, high = array.min(0), array.max(0)
+        saturated = np.zeros(low.shape, dtype=np.int64)
+        if bounds is not None:
+            middle, half = (np.add(bounds[1], sign * np.asarray(bounds[0])) / 2 for sign in (1, -1))
+            saturated += (np.abs(array - middle) >= SATURATED * half).sum(0)
+        return cls(str(array.dtype), low, high, saturated)
 
     def include(self, other: Extent) -> None:
         """Includes the range of another episode."""
@@ -108,7 +112,8 @@ def summarise(
             continue
         problems = list(find_problems(episode, layout=layout, bounds=bounds))
         summary.problems += [(f"{prefix}{name}/{key}", message) for key, message in problems]
-        _add_ranges(summary, episode)
+        # Steps of faulty episodes are not counted, so neither are those at the bounds.
+        _add_ranges(summary, episode, None if problems else bounds)
         if not problems:
             layout = layout or layout_of(episode)
             _add(summary, name, episode)
@@ -149,16 +154,17 @@ def _add(summary: Summary, name: str, episode: Episode) -> None:
         summary.failed += [] if succeeded else [name]
 
 
-def _add_ranges(summary: Summary, episode: Episode) -> None:
+def _add_ranges(summary: Summary, episode: Episode, bounds: Bounds | None) -> None:
     """Includes all comparable arrays, even those out of bounds, so that the ranges show it."""
     for name, array in {"actions": episode.actions, **episode.observations}.items():
         if array.dtype.kind not in "biuf" or not array.ndim or 0 in array.shape:
             continue
         known = summary.ranges.get(name)
+        extent = Extent.of(array, bounds if name == "actions" else None)
         if known is None:
-            summary.ranges[name] = Extent.of(array)
+            summary.ranges[name] = extent
         elif np.shape(known.low) == array.shape[1:]:
-            known.include(Extent.of(array))
+            known.include(extent)
 
 
 def _digest(episode: Episode) -> str:
@@ -187,7 +193,7 @@ def _warnings(summary: Summary, bounds: Bounds | None) -> Iterator[str]:
     share = np.ravel(actions.saturated / max(1, steps))
     # A dimension that is always there has two commands, such as a gripper's.
     for i in np.flatnonzero((share > 0.5) & (share < 1)):
-        yield f"actions: dimension {i} is at ±1 in {share[i]:.0%} of all steps"
+        yield f"actions: dimension {i} is at a bound in {share[i]:.0%} of all steps"
     if bounds is None and (np.min(actions.low) < -1 or np.max(actions.high) > 1):
         yield "actions: outside [-1, 1]; give the loss their bounds"
 

@@ -76,7 +76,8 @@ def best_episodes(data: TensorDictBase, share: float = 0.1) -> TensorDictBase:
 
     Args:
         data: transitions of one step, ``[N]``, with ``episode (N,)`` and ``("next", "reward")
-            (N, 1)``.
+            (N, 1)``. Number the episodes of several data sets first
+            (:func:`torchrl_bmrl.data.replay.number_episodes`).
         share: share of the episodes to select; at least one is. Of equal returns the earlier
             episodes are selected.
 
@@ -84,7 +85,8 @@ def best_episodes(data: TensorDictBase, share: float = 0.1) -> TensorDictBase:
         their transitions, in the order of the data.
 
     Raises:
-        BMRLError: for a share outside [0, 1], data of n steps, or without ``episode`` or reward.
+        BMRLError: for a share outside [0, 1], data of n steps, or without ``episode`` or reward,
+            and if a ``step`` occurs twice in an episode, as after ``torch.cat`` of two data sets.
 
     Example:
         >>> from tensordict import TensorDict
@@ -99,6 +101,14 @@ def best_episodes(data: TensorDictBase, share: float = 0.1) -> TensorDictBase:
         if data.get(key, None) is None:
             raise missing(data, key)
     episodes, index = data["episode"].reshape(-1).unique(return_inverse=True)
+    if (step := data.get("step", None)) is not None:
+        rows, counts = torch.stack([index, step.reshape(-1)]).unique(dim=1, return_counts=True)
+        if (counts > 1).any():
+            number, at = rows[:, counts.argmax()].tolist()
+            raise BMRLError(
+                f"episode {int(episodes[number])} has step {at} {int(counts.max())} times; valid: "
+                "one number for each episode, as torchrl_bmrl.data.replay.number_episodes gives"
+            )
     returns = torch.zeros(len(episodes), dtype=torch.float64, device=index.device)
     returns.index_add_(0, index, data["next", "reward"].reshape(-1).double())
     number = max(1, round(share * len(episodes)))

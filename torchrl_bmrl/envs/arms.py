@@ -38,18 +38,15 @@ def check_arm(robot: str) -> str:
     return robot
 
 
-def inverse_kinematics(
-    env: Any, target: np.ndarray, *, tolerance: float = 1e-5, iterations: int = 100
-) -> np.ndarray:
+def inverse_kinematics(env: Any, target: np.ndarray) -> np.ndarray:
     """Joint positions (n,) [rad] that bring the end-effector to a point.
 
-    Damped least squares from the present joints; the present orientation is kept.
+    At most 100 steps of damped least squares from the present joints, until each coordinate [m] and
+    the rotation [rad] have an error below 1e-5; the present orientation is kept.
 
     Args:
         env: robosuite environment with one arm.
         target: (3,) [m].
-        tolerance: largest error of each coordinate [m] and of the rotation [rad].
-        iterations: largest number of steps.
 
     Raises:
         BMRLError: if no joints are found.
@@ -69,12 +66,12 @@ def inverse_kinematics(
     qpos, qvel = robot._ref_joint_pos_indexes, robot._ref_joint_vel_indexes
     orientation = scratch.site_xmat[site].reshape(3, 3).copy()
     jacp, jacr = np.zeros((3, model.nv)), np.zeros((3, model.nv))
-    for _ in range(iterations):
+    for _ in range(100):
         current = scratch.site_xmat[site].reshape(3, 3)
         error = np.empty(6)
         error[:3] = target - scratch.site_xpos[site]
         error[3:] = rotation_error(current, orientation)
-        if np.abs(error).max() < tolerance:
+        if np.abs(error).max() < 1e-5:
             return scratch.qpos[qpos].copy()
         mujoco.mj_jacSite(model, scratch, jacp, jacr, site)
         jacobian = np.vstack([jacp[:, qvel], jacr[:, qvel]])

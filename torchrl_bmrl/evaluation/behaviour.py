@@ -178,7 +178,7 @@ def effective_number(outcomes: Iterable[Hashable]) -> float:
     return float(np.exp(-(shares * np.log(shares)).sum()))
 
 
-def matching_noise(actions: ArrayLike, size: float, *, seed: int = 0) -> float:
+def matching_noise(actions: ArrayLike, size: float) -> float:
     r"""Standard deviation of action noise that causes a given mean deviation of the actions.
 
     It is the :math:`\sigma` for which the mean over actions of
@@ -188,7 +188,6 @@ def matching_noise(actions: ArrayLike, size: float, *, seed: int = 0) -> float:
     Args:
         actions: actions without noise, in [-1, 1], shape ``(N, action_dim)``.
         size: mean norm of the deviation.
-        seed: seed of the draws.
 
     Raises:
         BMRLError: if no noise within the bounds causes such a deviation.
@@ -199,7 +198,7 @@ def matching_noise(actions: ArrayLike, size: float, *, seed: int = 0) -> float:
         0.1
     """
     array = _finite(actions, "actions")
-    noise = np.random.default_rng(seed).standard_normal(array.shape)
+    noise = np.random.default_rng(0).standard_normal(array.shape)
 
     def reached(sigma: float) -> float:
         return float(np.linalg.norm(np.clip(array + sigma * noise, -1, 1) - array, axis=-1).mean())

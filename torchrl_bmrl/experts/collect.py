@@ -18,6 +18,7 @@ from torchrl_bmrl.data.robomimic import (
     count_episodes,
     keep_episode,
     read_kept_episode,
+    read_metadata,
     write_episodes,
 )
 from torchrl_bmrl.errors import BMRLError, ConfigError, DataError
@@ -99,8 +100,8 @@ def collect_demonstrations(
         ConfigError: for a task without ``record``, or with one that takes no ``like`` if there are
             ``context_episodes``, and for invalid ``experts``.
         UnknownNameError: for a name in ``after`` that is not a task.
-        DataError: if an existing file has another number of episodes, or a folder in ``directory``
-            is a link.
+        DataError: if an existing file has another number of episodes or another seed, or a folder
+            in ``directory`` is a link.
         FolderInUseError: if another process records some of the tasks.
         StoppedError: if the run is stopped; finished episodes are saved.
 
@@ -209,6 +210,10 @@ def collect_demonstrations(
                 f"contains {count_episodes(path)} episodes; valid: {counts[name]}; choose another "
                 "run_dir or remove the file",
             )
+        recorded = read_metadata(path).get("seed", seed)
+        if recorded != seed:
+            message = f"recorded with seed {recorded}; valid: {seed}, or another folder"
+            raise DataError(path, "data", message)
     return files
 
 

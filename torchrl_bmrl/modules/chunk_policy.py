@@ -9,6 +9,9 @@ from tensordict.utils import NestedKey
 
 from torchrl_bmrl.errors import BMRLError
 
+CHUNK, STEP = "action_chunk", "action_chunk_step"
+"""Entries for the next step: the chunk, and how many of its actions were played."""
+
 
 class ChunkPolicy(TensorDictModuleBase):
     """Plays the actions of a chunk one after the other, then asks its policy for the next chunk.
@@ -26,12 +29,11 @@ class ChunkPolicy(TensorDictModuleBase):
         size: number of actions in a chunk.
 
     Keyword Args:
-        action_key, chunk_key, step_key: names of the entries that it writes.
-        init_key: flag of an episode's first step, which the data may lack.
+        action_key: name of the action.
 
-    Keys read: those of the policy. Keys written: ``action (*B, action_dim)``, and for the next step
-    ``action_chunk (*B, size, action_dim)`` and ``action_chunk_step (*B, 1)``, the number of its
-    actions that were played.
+    Keys read: those of the policy, and ``is_init`` if the data have it. Keys written: ``action
+    (*B, action_dim)``, and for the next step ``action_chunk (*B, size, action_dim)`` and
+    ``action_chunk_step (*B, 1)``, the number of its actions that were played.
 
     Raises:
         BMRLError: for a size below one; and at a call if the policy does not write ``action_key``,
@@ -51,36 +53,32 @@ class ChunkPolicy(TensorDictModuleBase):
         size: int,
         *,
         action_key: NestedKey = "action",
-        chunk_key: NestedKey = "action_chunk",
-        step_key: NestedKey = "action_chunk_step",
-        init_key: NestedKey = "is_init",
     ) -> None:
         super().__init__()
         if size < 1:
             raise BMRLError(f"size is {size}; valid: at least 1")
         self.policy, self.size = policy, size
-        self.action_key, self.chunk_key, self.step_key = action_key, chunk_key, step_key
-        self.init_key = init_key
+        self.action_key = action_key
         self.in_keys = list(policy.in_keys)
-        self.out_keys = [action_key, chunk_key, step_key]
+        self.out_keys = [action_key, CHUNK, STEP]
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the next action of the chunk."""
-        step, chunk = tensordict.get(self.step_key, None), tensordict.get(self.chunk_key, None)
+        step, chunk = tensordict.get(STEP, None), tensordict.get(CHUNK, None)
         if step is None or chunk is None:
             chunk = self._next_chunk(tensordict)
             step = torch.zeros(*chunk.shape[:-2], 1, dtype=torch.int64, device=chunk.device)
         else:
             ended = step >= self.size
-            if (first := tensordict.get(self.init_key, None)) is not None:
+            if (first := tensordict.get("is_init", None)) is not None:
                 ended = ended | first.reshape(ended.shape)
             if ended.any():
                 chunk = torch.where(ended.unsqueeze(-1), self._next_chunk(tensordict), chunk)
                 step = step.masked_fill(ended, 0)
         index = step.unsqueeze(-1).expand(*step.shape[:-1], 1, chunk.shape[-1])
         tensordict.set(self.action_key, chunk.gather(-2, index).squeeze(-2))
-        return tensordict.set(self.chunk_key, chunk).set(self.step_key, step + 1)
+        return tensordict.set(CHUNK, chunk).set(STEP, step + 1)
 
     def _next_chunk(self, tensordict: TensorDictBase) -> torch.Tensor:
         """The policy's chunk for the present state, ``(*B, size, action_dim)``."""

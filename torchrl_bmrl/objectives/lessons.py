@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_bmrl.functional import sample_action_latent
+from torchrl_bmrl.objectives.task_rows import draw_partners
 
 if TYPE_CHECKING:
     from torchrl_bmrl.objectives.distillation import MetaDistillationLoss
@@ -33,9 +34,7 @@ def draw_mix(latent: Tensor, valid: Tensor | None, fraction: float) -> Mix:
         valid: which rows count; a row is not mixed with one that does not.
         fraction: of the rows that are mixed.
     """
-    num_tasks, device = len(latent), latent.device
-    shift = torch.randint(1, num_tasks, (1,), device=device)
-    partner = (torch.arange(num_tasks, device=device) + shift) % num_tasks
+    partner = draw_partners(len(latent), latent.device)
     share = torch.rand_like(latent[..., :1])
     mixed = torch.rand_like(share) < fraction
     if valid is not None:

@@ -22,6 +22,7 @@ from torchrl_bmrl.objectives.contexts import Embedded, assign, group_rows, which
 from torchrl_bmrl.objectives.data import next_key
 from torchrl_bmrl.objectives.distillation import MetaDistillationLoss
 from torchrl_bmrl.objectives.relabel import predict, read_reward
+from torchrl_bmrl.objectives.task_rows import draw_partners
 
 
 class MBMLLoss(MetaDistillationLoss):
@@ -232,8 +233,7 @@ class MBMLLoss(MetaDistillationLoss):
         The mask of both has the transitions alone whose new reward counts, and may be empty.
         """
         device = rows.get(next_key(self.tensor_keys.reward)).device
-        shift = torch.randint(1, self.num_tasks, (1,), device=device)
-        lender = (torch.arange(self.num_tasks, device=device) + shift) % self.num_tasks
+        lender = draw_partners(self.num_tasks, device)
         read = self._entries(tensordict, self.reward_models.in_keys)[lender]
         prediction = predict(self, read, None)
         limit = self.max_deviation * self.reward_scale.unsqueeze(-1)

@@ -6,6 +6,17 @@ import torch
 from torch import Tensor
 
 
+def draw_partners(num_tasks: int, device: torch.device) -> Tensor:
+    """For each task another one, ``(num_tasks,)``: all are shifted by the same random number.
+
+    Args:
+        num_tasks: at least two.
+        device: of the result.
+    """
+    shift = torch.randint(1, num_tasks, (1,), device=device)
+    return (torch.arange(num_tasks, device=device) + shift) % num_tasks
+
+
 def draw_rows(task_latent: Tensor, valid: Tensor | None, number: int) -> Tensor:
     """For each row the m of some random rows of its task, ``(num_tasks, B, number, m)``.
 

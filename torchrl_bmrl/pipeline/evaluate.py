@@ -272,8 +272,11 @@ def _play_experts(
         for seed, expert in zip(seeds, cycle(experts), strict=False)
     )
     return [
-        EpisodeOutcome(float(episode.rewards.sum()), bool(episode.extras["successes"].any()))
+        EpisodeOutcome(
+            float(episode.rewards.sum()), None if successes is None else bool(successes.any())
+        )
         for episode in episodes
+        for successes in [episode.extras.get("successes")]
     ]
 
 
@@ -325,10 +328,14 @@ def _embed(student: Student, data: TensorDictBase) -> np.ndarray:
 
 
 def _distance(raw: TensorDictBase) -> np.ndarray:
-    """Distance of the end-effector to the goal [m]; nan for observations without both."""
-    if "goal_pos" not in raw or "robot0_eef_pos" not in raw:
-        return np.full(len(raw), np.nan)
-    return (raw["robot0_eef_pos"] - raw["goal_pos"]).norm(dim=-1).numpy()
+    """Distance of the end-effector to the goal [m]; nan for observations that do not show it.
+
+    Where a task hides its goal, ``goal_pos`` is the position of the end-effector itself.
+    """
+    distance = np.zeros(len(raw))
+    if "goal_pos" in raw and "robot0_eef_pos" in raw:
+        distance = (raw["robot0_eef_pos"] - raw["goal_pos"]).norm(dim=-1).numpy()
+    return distance if distance.any() else np.full(len(raw), np.nan)
 
 
 def _success(raw: TensorDictBase) -> np.ndarray:

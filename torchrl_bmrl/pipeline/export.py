@@ -121,7 +121,7 @@ def _write_policy(run: Run, student: Student, metadata: dict[str, Any]) -> None:
         action=metadata["student"]["action_dim"],
         draw="N(0, I)" if clip is None else f"N(0, I) and clipped to ±{clip:g}",
         demonstrations=markdown_text(run_facts(run)["Demonstrations"]),
-        bcq_updates=bcq.epochs * bcq.updates_per_epoch,
+        bcq_updates=bcq.updates,
         bcq_batch=bcq.batch_size,
         bcq_lr=bcq.lr,
         updates=distill.updates,

@@ -150,7 +150,7 @@ def _held_out(run: Run, name: str, report: Report) -> dict[str, str | float]:
 def _critic_updates(run: Run) -> int:
     """Updates of fitted Q evaluation: 3,000, or as many as stage 1 has if these are fewer."""
     bcq = run.settings.bcq
-    return min(3000, bcq.epochs * bcq.updates_per_epoch)
+    return min(3000, bcq.updates)
 
 
 def _discounted_return(data: TensorDictBase, gamma: float) -> float:

@@ -106,6 +106,11 @@ class BCQSettings:
     seeds: int = setting(1, above=0)  # agents per task; further ones: bcq/<task>-<seed>
     stacked: bool = False  # all agents in one program, for a GPU; else one process each
 
+    @property
+    def updates(self) -> int:
+        """Of each network in all epochs."""
+        return self.epochs * self.updates_per_epoch
+
     def check_single_actions(self, where: str) -> None:
         """Checks that the agents propose single actions.
 

@@ -69,7 +69,7 @@ def stage1(run: Run) -> None:
     trained = run.jobs(
         train_job,
         [agents] if stacked else [{name: task} for name, task in agents.items()],
-        total=bcq.epochs * bcq.updates_per_epoch * len(agents),
+        total=bcq.updates * len(agents),
         description="stage 1: training BCQ",
         unit="update",
     )
@@ -124,7 +124,7 @@ def train_agents(
     if trained.updates:
         log.debug("bcq %s: resumed from update %d", ", ".join(agents), trained.updates)
         report(trained.updates * len(agents))
-    total = bcq.epochs * bcq.updates_per_epoch
+    total = bcq.updates
     unfinished = trained.updates < total
     if unfinished:
         with ExitStack() as stack:

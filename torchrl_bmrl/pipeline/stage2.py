@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.optim import Adam
 
 from torchrl_bmrl.data import make_multi_task_replay_buffer, with_previous
-from torchrl_bmrl.functional import nonzero_scale, sample_action_latent
+from torchrl_bmrl.functional import nonzero_scale
 from torchrl_bmrl.modules import BCQPolicy, reads_context
 from torchrl_bmrl.modules.scales import unmarked
 from torchrl_bmrl.modules.task_latent import TRANSITION_KEYS
@@ -112,7 +112,7 @@ def advantage_scale(
 
     Args:
         teachers: one per task.
-        datasets: the states, ``[N_i]`` each; 512 to 1023 of them are used.
+        datasets: the states, ``[N_i]`` each; of 1024 and more, 512 to 1023 are used.
         qvalue_scale: deviations that the values are divided by; ``None`` for 1.
 
     Returns:
@@ -381,12 +381,8 @@ def proposals(
         m = student.embed_context(batch).unsqueeze(1).expand(*batch.batch_size, -1)
     else:
         m = student.embed(batch)
-    data = batch.select("observation").set("task_latent", m)
-    data = data.unsqueeze(-1).expand(*data.batch_size, 10)
+    policy = student.policy(num_candidates=10, latent_clip=latent_clip)
     on_gpu = torch.device(device).type == "cuda"
     # Training draws the same random numbers with and without this check.
     with torch.random.fork_rng([torch.device(device)] if on_gpu else []):
-        latent = sample_action_latent(
-            (*data.batch_size, student.latent_dim), latent_clip=latent_clip, device=device
-        )
-    return student.generator(data.set("action_latent", latent))["action"]
+        return policy.propose(batch.select("observation").set("task_latent", m))["action"]

@@ -97,7 +97,7 @@ def baselines(run: Run, settings: BaselineSettings) -> str:
     check_playable(run.tasks)
     check_coefficients(settings.coefficients, "baselines.coefficients")
     run.statistics  # noqa: B018 (missing demonstrations are found before anything is written)
-    total = settings.updates or stage_1_updates(run)
+    total = settings.updates or run.settings.bcq.updates
     names = [name for name in BASELINES if name in settings.algorithms]
     if ONE_HOT in names:
         run.settings.bcq.check_single_actions(f"baselines.algorithms with {ONE_HOT}")
@@ -161,16 +161,11 @@ def baselines(run: Run, settings: BaselineSettings) -> str:
     return "\n".join(table.markdown() for table in tables.values())
 
 
-def stage_1_updates(run: Run) -> int:
-    """The number of updates of a stage-1 agent."""
-    return run.settings.bcq.epochs * run.settings.bcq.updates_per_epoch
-
-
 def has_agents(run: Run) -> bool:
     """Whether the run has a finished stage-1 agent of every task."""
     paths = [run.agent_path(name) for name in run.names]
     return all(path.exists() for path in paths) and all(
-        load_bcq_loss(path)[1]["updates"] == stage_1_updates(run) for path in paths
+        load_bcq_loss(path)[1]["updates"] == run.settings.bcq.updates for path in paths
     )
 
 

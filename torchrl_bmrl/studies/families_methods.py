@@ -71,6 +71,25 @@ _WAYS = {
 """Of each method that acts by m: who learned it, and what m is made of."""
 
 
+def nearest_code(codes: Tensor, code: Tensor, repeats: Sequence[float] | None) -> int:
+    """Position of the trained member that is nearest to a parameter.
+
+    Args:
+        codes: of the trained members, ``(num_tasks, n)``.
+        code: of the parameter, ``(n,)``.
+        repeats: after which each number means the same again; ``None``: never.
+
+    Example:
+        >>> nearest_code(torch.tensor([[-1.0], [0.0], [1.0]]), torch.tensor([1.3]), [2.4])
+        0
+    """
+    apart = codes - code
+    if repeats is not None:
+        turn = torch.tensor(repeats)
+        apart = torch.remainder(apart + turn / 2, turn) - turn / 2
+    return int(apart.norm(dim=-1).argmin())
+
+
 @dataclass
 class FamilySettings:
     """Settings of :func:`torchrl_bmrl.studies.families.generalise`."""
@@ -159,7 +178,7 @@ def make_method(
         return policy, PrototypeTaskLatent(torch.zeros(1))
     code = torch.tensor(run.family.told(task.name), dtype=torch.float32)
     codes = torch.tensor(run.codes(), dtype=torch.float32)
-    nearest = int((codes - code).norm(dim=-1).argmin())
+    nearest = nearest_code(codes, code, run.family.repeats)
     if method == "teacher":
         count = run.settings.evaluate.num_candidates
         teacher = BCQPolicy.frozen(run.teacher(run.names[nearest]), num_candidates=count)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -54,8 +55,9 @@ def make_tables(
             ]
             differences.append([*line, *cells])
     runs = {key[:2] for name in methods for key in _column(_episodes(rows, None, name), "return")}
-    about = "other members" if len(runs) == 1 else "other training seeds and other members"
-    note = f"Brackets: 95% interval about {about}."
+    of_families = Counter(family for family, _ in runs)
+    over = "training seeds and members" if min(of_families.values(), default=1) > 1 else "members"
+    note = f"Brackets: 95% intervals, which cover the variation over {over}."
     start = ("Members", "Policy")
     held_out = f"Held-out members of {title}"
     return {

@@ -152,7 +152,7 @@ def evaluate_job(job: tuple[Run, tuple[str, int, FQESettings]], report: Report) 
     """Computes the estimate and the true return of one agent, or loads their file."""
     run, (name, updates, settings) = job
     (row,) = run.once(
-        f"fqe/{name}/{updates}.csv",
+        f"{settings.folder}/{name}/{updates}.csv",
         partial(read_rows, columns=COLUMNS, expected=[{"task": name, "updates": updates}]),
         lambda path: write_rows(path, [_evaluate(run, name, updates, settings, report)]),
         skipped=lambda: report(_units(run, name, settings)),

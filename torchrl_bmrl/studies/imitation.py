@@ -31,7 +31,8 @@ from torchrl_bmrl.modules.demonstration_latent import ALIGNMENTS
 from torchrl_bmrl.modules.task_latent import check_reads_transitions
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.reports import Section, Table, write_study
-from torchrl_bmrl.rows import read_rows, whole, write_rows
+from torchrl_bmrl.reports.tables import MISSING
+from torchrl_bmrl.rows import one_of, read_rows, whole, write_rows
 from torchrl_bmrl.run.folder import open_run
 from torchrl_bmrl.run.progress import progress
 from torchrl_bmrl.run.settings import setting
@@ -43,7 +44,8 @@ METHODS = (*(f"demonstration, by {name}" for name in ALIGNMENTS), "task index", 
 PERTURBATIONS = ("none", "magnitude", "direction", "both", "both, constant")
 _COLUMNS: dict[str, Any] = {
     **dict.fromkeys(("method", "perturbation"), str),
-    **dict.fromkeys(("demonstration", "episode", "stages", "success"), whole),
+    **dict.fromkeys(("demonstration", "episode", "stages"), whole),
+    "success": one_of("", "0", "1"),  # empty for a task without a definition of success
 }
 
 
@@ -160,8 +162,9 @@ def play_job(job: tuple[Run, Job], report: Report) -> list[dict[str, Any]]:
         seeds = [run.seed("imitate", number, i) for i in range(count)]
         outcomes = run.play(task, policy, *transforms, seeds=seeds, report=report)
         rows = [
-            {**known, "stages": outcome.stages, "success": int(outcome.success or 0)}
+            {**known, "stages": outcome.stages, "success": x}
             for known, outcome in zip(episodes, outcomes, strict=True)
+            for x in ["" if outcome.success is None else str(int(outcome.success))]
         ]
         write_rows(path, rows)
 
@@ -241,12 +244,15 @@ def make_table(settings: ImitateSettings, titles: list[str], rows: list[dict[str
         for perturbation in PERTURBATIONS:
             mine = [r for r in rows if (r["method"], r["perturbation"]) == (method, perturbation)]
             done = [row["stages"] for row in mine]
-            whole_chain = [float(row["success"]) for row in mine]
+            whole_chain = [float(row["success"]) for row in mine if row["success"] != ""]
             reached = [sum(d > i for d in done) / len(done) for i in range(len(titles))]
-            strata = [row["demonstration"] for row in mine]
-            low, high = bootstrap_interval(whole_chain, strata=strata)
             line = [method, perturbation, *(f"{share:.0%}" for share in reached)]
-            line += [f"{sum(whole_chain) / len(mine):.0%}", f"[{low:.0%}, {high:.0%}]"]
+            if whole_chain:
+                strata = [row["demonstration"] for row in mine]
+                low, high = bootstrap_interval(whole_chain, strata=strata)
+                line += [f"{sum(whole_chain) / len(mine):.0%}", f"[{low:.0%}, {high:.0%}]"]
+            else:
+                line += [MISSING, MISSING]
             lines.append([*line, str(len(mine))])
     low, high = settings.magnitude
     stages = [f"{i}. {title}" for i, title in enumerate(titles, 1)]

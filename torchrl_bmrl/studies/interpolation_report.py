@@ -123,7 +123,7 @@ def switching_table(title: str, played: Mapping[str, Episodes], frequency: float
         leaving = episodes["label"].astype(int)
         early = sum(success[i, : leaving[i]].any() for i in range(len(success)))
         apart = np.linalg.norm(episodes["eef"] - played["stay"]["eef"], axis=-1)
-        first = success.argmax(1)[success.any(1)] / frequency
+        first = (success.argmax(1)[success.any(1)] + 1) / frequency  # after the step that succeeds
         line = [SWITCHES[name], str(len(success))]
         line += [with_interval(x.astype(float), ".2f") for x in (success.any(1), success[:, -1])]
         line += [str(early), f"{np.median(first):.2f}" if len(first) else MISSING]

@@ -14,6 +14,8 @@ import torch
 from torchrl_bmrl.data import make_mixed_replay_buffer
 from torchrl_bmrl.data.convert import convert, find_format
 from torchrl_bmrl.data.demonstrations import read_demonstrations
+from torchrl_bmrl.data.importing import copy_scaled, read_original_bounds
+from torchrl_bmrl.data.options import Bounds
 from torchrl_bmrl.data.source_files import files_of
 from torchrl_bmrl.envs.transforms import transform_data
 from torchrl_bmrl.errors import ConfigError, UnknownNameError
@@ -96,27 +98,29 @@ def learn_from_people(run: Run, settings: HumanSettings) -> str:
         tasks = [f"{module}{colon}{settings.task}"]
     alone = Run(replace(run.settings, run_dir=str(folder / "run"), base=None, tasks=tasks))
     check_playable(alone.tasks)
+    raw = _is_raw(settings)  # an error for a missing file comes before anything is recorded
     # More shares and seeds may join the finished ones, with the same demonstrations.
     held = {name: getattr(settings, name) for name in ("path", "task", "tracking")}
     files = {"human.path": files_of(settings.path)}
-    with lock_run(folder, held, files=files):
-        _convert(settings, folder / "demonstrations.hdf5")
-        with alone:
-            collect(alone)
-            alone.jobs(
-                train_job,
-                agents,
-                total=bcq.epochs * bcq.updates_per_epoch * len(agents),
-                description="training BCQ",
-                unit="update",
-            )
-            parts = alone.jobs(
-                evaluate_job,
-                agents,
-                total=evaluate.episodes * alone.horizon(alone.tasks[0]) * len(agents),
-                description="evaluating",
-                unit="step",
-            )
+    with lock_run(folder, held, files=files), alone:
+        collect(alone)
+        # In the units of the task's own actions.
+        bounds = read_original_bounds(alone.demonstrations(settings.task)) or (-1.0, 1.0)
+        _convert(settings, folder / "demonstrations.hdf5", raw, bounds)
+        alone.jobs(
+            train_job,
+            agents,
+            total=bcq.updates * len(agents),
+            description="training BCQ",
+            unit="update",
+        )
+        parts = alone.jobs(
+            evaluate_job,
+            agents,
+            total=evaluate.episodes * alone.horizon(alone.tasks[0]) * len(agents),
+            description="evaluating",
+            unit="step",
+        )
     rows = [row for part in parts for row in part]
     write_rows(run.folder / "human.csv", rows)
     table = make_table(rows, run.titles[settings.task])
@@ -129,25 +133,21 @@ def _is_raw(settings: HumanSettings) -> bool:
     return find_format(Path(settings.path)) == "robosuite"
 
 
-def _convert(settings: HumanSettings, path: Path) -> None:
+def _convert(settings: HumanSettings, path: Path, raw: bool, bounds: Bounds) -> None:
     """Writes the human demonstrations in robomimic's layout, if the file is not there."""
     if path.exists():
         return
-    raw = _is_raw(settings)
     with progress(None, "converting", "episode") as bar:
 
         def report(episodes: int) -> None:
             bar.update(episodes)
             check_stop()
 
-        done = convert(
-            settings.path,
-            path,
-            to="robomimic",
-            task=settings.task if raw else None,
-            tracking=settings.tracking if raw else 1.0,
-            report=report,
-        )
+        if raw:
+            relabel = {"task": settings.task, "tracking": settings.tracking}
+            done = convert(settings.path, path, to="robomimic", report=report, **relabel)
+        else:
+            done = copy_scaled(settings.path, path, bounds=bounds, report=report)
     for note in done.notes:
         log.warning("%s: %s", settings.path, note)
 
