@@ -204,7 +204,7 @@ def test_the_pages_list_all_losses_and_networks(name: str) -> None:
         if isinstance(x, type) and issubclass(x, kind) and x.__module__.startswith(f"{name}.")
         if not key.startswith("_")
     }
-    assert defined - {"Ensemble"} <= set(public(name))
+    assert defined - {"Ensemble", "Network"} <= set(public(name))  # bases of others
 
 
 @each_module

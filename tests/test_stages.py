@@ -103,7 +103,7 @@ def test_a_run_of_an_earlier_version_goes_on_without_the_settings_that_it_did_no
     shutil.copytree(trained, folder)
     path = folder / "config.yaml"
     settings = yaml.safe_load(path.read_text()) | {"run_dir": str(folder)}
-    for group, name in (("bcq", "acting_rule"), ("distill", "advantage_weight")):
+    for group, name in (("bcq", "acting_rule"), ("distill", "temperature")):
         del settings[group][name]
     path.write_text(yaml.safe_dump(settings))
     run = file_run(trained)  # the demonstrations lie there

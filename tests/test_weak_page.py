@@ -223,7 +223,7 @@ def test_a_missed_target_is_named_in_short() -> None:
     run = make_run("weak_paper")
     rows = make_weak_rows(failures={(BCQ, "lift"): 2})
     page = make_weak_page(Published().with_run(run, rows, [])).text
-    assert "12 of 13 targets are met; not met: BCQ: success." in page
+    assert "12 of 13 targets are met. Not met:\n\n- BCQ: success\n" in page
 
 
 def test_ablations_of_stage_1_alone_are_read_from_the_last_rollouts(page: str) -> None:

@@ -55,7 +55,7 @@ class KeyedLoss(LossModule):
     fixed_options: ClassVar[tuple[str, ...]] = ()
     """Options of the base that a subclass sets itself and does not accept."""
     frozen_networks: ClassVar[tuple[str, ...]] = ()
-    """Networks that this loss never trains; they stay in evaluation mode."""
+    """Networks that stay in evaluation mode, since this loss never trains them."""
     separate_losses = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -170,8 +170,7 @@ class KeyedLoss(LossModule):
         if target is not None:
             target.data.update_(params.data)
 
-    def __getstate__(self) -> dict[str, Any]:
-        # Policies follow this loss, not its copies.
+    def __getstate__(self) -> dict[str, Any]:  # policies follow this loss, not its copies
         return {key: value for key, value in self.__dict__.items() if key != "_followers"}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Any:
@@ -277,12 +276,15 @@ class KeyedLoss(LossModule):
     # -- networks ---------------------------------------------------------------------------------
 
     @property
-    def _networks(self) -> dict[str, nn.Module]:
-        # TorchRL keeps them outside the modules of a loss, which have only their parameters.
+    def _networks(self) -> dict[str, nn.Module]:  # TorchRL keeps them outside of a loss's modules
         return {name: x for name, x in vars(self).items() if isinstance(x, nn.Module)}
 
     def train(self: Self, mode: bool = True) -> Self:
-        """Sets the mode of this loss and of its networks, for example of their dropout."""
+        """Sets the mode of this loss and of its networks, for example of their dropout.
+
+        Args:
+            mode: training, or evaluation.
+        """
         super().train(mode)
         for name, network in self._networks.items():
             network.train(mode and name not in self.frozen_networks)

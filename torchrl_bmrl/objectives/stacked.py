@@ -244,7 +244,11 @@ class StackedLoss(LossModule):
         return super()._apply(fn)
 
     def train(self: Self, mode: bool = True) -> Self:
-        """Sets the mode of all members and of their networks."""
+        """Sets the mode of all members and of their networks.
+
+        Args:
+            mode: training, or evaluation.
+        """
         for loss in self._all():
             loss.train(mode)
         return super().train(mode)

@@ -61,8 +61,7 @@ def stage1_curves(
     for (task, title, color), axes in zip(drawn, panels, strict=False):
         epochs = np.array([epoch for epoch, _, _ in curves[task]])
         mean = np.array([returns.mean() for _, _, returns in curves[task]])
-        spread = [returns.std(ddof=min(1, len(returns) - 1)) for _, _, returns in curves[task]]
-        std = np.array(spread)
+        std = np.array([returns.std() for _, _, returns in curves[task]])
         axes.fill_between(epochs, mean - std, mean + std, color=color, alpha=0.25, linewidth=0)
         axes.plot(epochs, mean, color=color, marker="o", markersize=3)
         if expert_means and task in expert_means:
