@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchrl_bmrl.data import robomimic
 from torchrl_bmrl.data.convert import Conversion, Stream, writing
@@ -122,7 +122,7 @@ def copy_scaled(
     bounds: Bounds,
     report: Callable[[int], object] = lambda _: None,
 ) -> Conversion:
-    """Writes demonstrations as :func:`import_demonstrations` does, without masks of its own.
+    """Copies demonstrations as :func:`import_demonstrations` does; even one, and without new masks.
 
     Args:
         source: as for :func:`import_demonstrations`.
@@ -131,7 +131,7 @@ def copy_scaled(
         report: called with 1 after every episode.
 
     Raises:
-        DataError: as :func:`import_demonstrations`; one episode is enough.
+        DataError: as :func:`import_demonstrations`.
 
     Example:
         >>> copy_scaled("nowhere.hdf5", "copy.hdf5", bounds=(-2.0, 2.0))
@@ -347,24 +347,24 @@ def _bounds_of_one(source: Source) -> Bounds:
         found = range_of_actions(source.episodes, source.episodes)
         within = np.min(found[0]) >= -1 and np.max(found[1]) <= 1
         bounds = (-1.0, 1.0) if within else found
-    before = _before(source)
-    if before is None:
+    if (known := _before(source)) is None:
         return bounds
-    low, high = before
-    return check_bounds(tuple(low + (np.asarray(bound) + 1) / 2 * (high - low) for bound in bounds))
+    ends: Any = [known[0] + (np.asarray(x) + 1) / 2 * (known[1] - known[0]) for x in bounds]
+    return check_bounds((ends[0], ends[1]))
 
 
-def _before(source: Source) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """The bounds that -1 and 1 had before the source was imported; ``None`` if it was not."""
+def _before(source: Source) -> tuple[Any, Any] | None:
+    """What -1 and 1 were before the source was imported; ``None`` if it was not."""
     found = _parse(source.path, source.metadata.get(ORIGINAL_BOUNDS))
-    return None if found is None else (np.asarray(found[0]), np.asarray(found[1]))
+    return found and (np.asarray(found[0]), np.asarray(found[1]))
 
 
 def _in_bounds(source: Source, bounds: Bounds) -> Source:
     """The source with actions in [-1, 1], of which these are the bounds before any import."""
-    low, high = (np.asarray(bound, dtype=np.float64) for bound in bounds)
-    if (before := _before(source)) is not None:
-        low, high = (2 * (x - before[0]) / (before[1] - before[0]) - 1 for x in (low, high))
+    ends: Any = [np.asarray(bound, dtype=np.float64) for bound in bounds]
+    if (known := _before(source)) is not None:
+        ends = [2 * (end - known[0]) / (known[1] - known[0]) - 1 for end in ends]
+    low, high = ends
     own = check_bounds((low, high))
 
     def scaled(name: str) -> Episode:
@@ -374,8 +374,8 @@ def _in_bounds(source: Source, bounds: Bounds) -> Source:
         return replace(episode, actions=actions.astype(episode.actions.dtype))
 
     kept = {k: x for k, x in source.metadata.items() if k not in ("action_bounds", ORIGINAL_BOUNDS)}
-    changes = np.any(low != -1) or np.any(high != 1)
-    episodes = LazyEpisodes(source.episodes, scaled) if changes else source.episodes
+    same = np.all(low == -1) and np.all(high == 1)
+    episodes = source.episodes if same else LazyEpisodes(source.episodes, scaled)
     return replace(source, bounds=(-1.0, 1.0), metadata=kept, episodes=episodes)
 
 

@@ -186,6 +186,7 @@ def share_as(loss: nn.Module, copy: nn.Module) -> None:
     for (first, key), *others in places.values():
         for name, other in others:
             held: Any = copy.get_submodule(name)
+            origin: Any = copy.get_submodule(first)
             with held._param_td.unlock_():
-                held._param_td.set(other, copy.get_submodule(first)._param_td.get(key))  # type: ignore[union-attr]
+                held._param_td.set(other, origin._param_td.get(key))
             held._reset_params()

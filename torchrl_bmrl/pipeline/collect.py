@@ -132,8 +132,8 @@ def read_episode(run: Run, task: Task, index: int, *, context: bool = False) -> 
     """
     if task.name in run.names:  # scaled already
         path = run.demonstrations(task.name)
-        bounds = read_original_bounds(path) or (-1.0, 1.0)
-        return read_scaled_episode(path, index, bounds=bounds, context=context)
+        bounds = read_original_bounds(path)
+        return read_scaled_episode(path, index, bounds=bounds or (-1.0, 1.0), context=context)
     assert task.files is not None
     bounds = _bounds_of_env(task) or read_original_bounds(run.demonstrations(run.names[0]))
     return read_scaled_episode(

@@ -144,7 +144,7 @@ def _convert(settings: HumanSettings, path: Path, raw: bool, bounds: Bounds) -> 
             check_stop()
 
         if raw:
-            relabel = {"task": settings.task, "tracking": settings.tracking}
+            relabel: dict[str, Any] = {"task": settings.task, "tracking": settings.tracking}
             done = convert(settings.path, path, to="robomimic", report=report, **relabel)
         else:
             done = copy_scaled(settings.path, path, bounds=bounds, report=report)
