@@ -81,9 +81,8 @@ def import_demonstrations(
         ...     terminated=r > 0,
         ... )
         >>> robomimic.write_episodes(folder / "own.hdf5", [episode] * 20, env_args={})
-        >>> done = import_demonstrations(
-        ...     folder / "own.hdf5", folder / "lift.hdf5", bounds=(-0.5, 0.5)
-        ... )
+        >>> files = folder / "own.hdf5", folder / "lift.hdf5"
+        >>> done = import_demonstrations(*files, bounds=(-0.5, 0.5))
         >>> (
         ...     done.account.read.steps,
         ...     len(robomimic.read_metadata(folder / "lift.hdf5")["masks"]["valid"]),
