@@ -6,6 +6,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -123,7 +124,7 @@ def test_a_source_that_is_replaced_before_it_is_imported_leaves_no_demonstration
 def test_human_demonstrations_that_were_overwritten_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def convert(settings: HumanSettings, path: Path) -> None:
+    def convert(settings: HumanSettings, path: Path, raw: bool, bounds: Any) -> None:
         write_atomic(path, "made")
         raise BMRLError("enough")
 
@@ -132,6 +133,7 @@ def test_human_demonstrations_that_were_overwritten_are_refused(
             learn_from_people(run, HumanSettings(path=str(path)))
 
     monkeypatch.setattr(people, "_convert", convert)
+    monkeypatch.setattr(people, "find_format", lambda path: "robosuite")
     path = tmp_path / "human.hdf5"
     path.write_text("first")
     for _ in range(2):

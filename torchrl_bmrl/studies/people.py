@@ -103,10 +103,12 @@ def learn_from_people(run: Run, settings: HumanSettings) -> str:
     held = {name: getattr(settings, name) for name in ("path", "task", "tracking")}
     files = {"human.path": files_of(settings.path)}
     with lock_run(folder, held, files=files), alone:
+        bounds = None
+        if alone.tasks[0].files is not None:
+            collect(alone)  # tells the units of the task's actions
+            bounds = read_original_bounds(alone.demonstrations(settings.task))
+        _convert(settings, folder / "demonstrations.hdf5", raw, bounds or (-1.0, 1.0))
         collect(alone)
-        # In the units of the task's own actions.
-        bounds = read_original_bounds(alone.demonstrations(settings.task)) or (-1.0, 1.0)
-        _convert(settings, folder / "demonstrations.hdf5", raw, bounds)
         alone.jobs(
             train_job,
             agents,
