@@ -124,7 +124,7 @@ def test_a_source_that_is_replaced_before_it_is_imported_leaves_no_demonstration
 def test_human_demonstrations_that_were_overwritten_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def convert(settings: HumanSettings, path: Path, raw: bool, bounds: Any) -> None:
+    def convert(settings: HumanSettings, path: Path, bounds: Any) -> None:
         write_atomic(path, "made")
         raise BMRLError("enough")
 
@@ -133,7 +133,6 @@ def test_human_demonstrations_that_were_overwritten_are_refused(
             learn_from_people(run, HumanSettings(path=str(path)))
 
     monkeypatch.setattr(people, "_convert", convert)
-    monkeypatch.setattr(people, "find_format", lambda path: "robosuite")
     path = tmp_path / "human.hdf5"
     path.write_text("first")
     for _ in range(2):

@@ -98,7 +98,6 @@ def learn_from_people(run: Run, settings: HumanSettings) -> str:
         tasks = [f"{module}{colon}{settings.task}"]
     alone = Run(replace(run.settings, run_dir=str(folder / "run"), base=None, tasks=tasks))
     check_playable(alone.tasks)
-    raw = _is_raw(settings)  # an error for a missing file comes before anything is recorded
     # More shares and seeds may join the finished ones, with the same demonstrations.
     held = {name: getattr(settings, name) for name in ("path", "task", "tracking")}
     files = {"human.path": files_of(settings.path)}
@@ -107,7 +106,7 @@ def learn_from_people(run: Run, settings: HumanSettings) -> str:
         if alone.tasks[0].files is not None:
             collect(alone)  # tells the units of the task's actions
             bounds = read_original_bounds(alone.demonstrations(settings.task))
-        _convert(settings, folder / "demonstrations.hdf5", raw, bounds or (-1.0, 1.0))
+        _convert(settings, folder / "demonstrations.hdf5", bounds or (-1.0, 1.0))
         collect(alone)
         alone.jobs(
             train_job,
@@ -135,7 +134,7 @@ def _is_raw(settings: HumanSettings) -> bool:
     return find_format(Path(settings.path)) == "robosuite"
 
 
-def _convert(settings: HumanSettings, path: Path, raw: bool, bounds: Bounds) -> None:
+def _convert(settings: HumanSettings, path: Path, bounds: Bounds) -> None:
     """Writes the human demonstrations in robomimic's layout, if the file is not there."""
     if path.exists():
         return
@@ -145,7 +144,7 @@ def _convert(settings: HumanSettings, path: Path, raw: bool, bounds: Bounds) -> 
             bar.update(episodes)
             check_stop()
 
-        if raw:
+        if _is_raw(settings):
             relabel: dict[str, Any] = {"task": settings.task, "tracking": settings.tracking}
             done = convert(settings.path, path, to="robomimic", report=report, **relabel)
         else:
