@@ -56,9 +56,12 @@ def test_rows_with_too_few_steps_left_are_dropped_unless_the_episode_terminates(
 
 
 @pytest.mark.parametrize("size", [1, 2])
-def test_padded_rows_are_no_chunks(size: int) -> None:
+@pytest.mark.parametrize("padding", [False, True])
+def test_padded_rows_are_no_chunks(size: int, padding: bool) -> None:
+    """Whatever their flags say."""
     data = episodes(5)
     data["mask"] = torch.tensor([True, True, True, False, False])
+    data["next", "terminated"][3:] = padding
     assert len(ActionChunks(size, gamma=0.5)(data)) == 4 - size
 
 

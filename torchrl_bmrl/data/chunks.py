@@ -74,11 +74,11 @@ class ActionChunks(nn.Module):
         steps: Tensor = data.get(STEPS_KEY)[..., 0]
         parts = [action[rows_later(steps.clamp(max=i + 1) - 1)] for i in range(size)]
         whole = steps == size
-        for key in MASK_KEYS:
-            if (mask := data.get(key, None)) is not None:
-                whole = whole & mask.reshape(whole.shape)
         if (terminated := data.get(self.outcome.terminated_key, None)) is not None:
             whole = whole | terminated[..., 0]
+        for key in MASK_KEYS:  # padded rows may say anything
+            if (mask := data.get(key, None)) is not None:
+                whole = whole & mask.reshape(whole.shape)
         if not whole.any():
             raise BMRLError(
                 f"size is {size}, and the longest episode has {int(steps.max())} steps; valid: a "
