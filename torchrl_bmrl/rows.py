@@ -212,6 +212,11 @@ def one_of(*valid: str) -> Callable[[str], str]:
     return parse
 
 
+def success_cell(success: bool | None) -> int | str:
+    """A success as 0 or 1; empty for a task without a definition of success."""
+    return "" if success is None else int(success)
+
+
 def flag(text: str) -> bool:
     """Parses a truth value, written as 0 or 1, or raises ``ValueError``."""
     return one_of("0", "1")(text) == "1"

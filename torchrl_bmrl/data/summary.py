@@ -41,8 +41,9 @@ class Extent:
         low, high = array.min(0), array.max(0)
         saturated = np.zeros(low.shape, dtype=np.int64)
         if bounds is not None:
-            middle, half = (np.add(bounds[1], sign * np.asarray(bounds[0])) / 2 for sign in (1, -1))
-            saturated += (np.abs(array - middle) >= SATURATED * half).sum(0)
+            first, last = (np.asarray(bound, dtype=float) for bound in bounds)
+            apart = np.abs(array - (first + last) / 2)
+            saturated += (apart >= SATURATED * (last - first) / 2).sum(0)
         return cls(str(array.dtype), low, high, saturated)
 
     def include(self, other: Extent) -> None:

@@ -102,9 +102,10 @@ def best_episodes(data: TensorDictBase, share: float = 0.1) -> TensorDictBase:
             raise missing(data, key)
     episodes, index = data["episode"].reshape(-1).unique(return_inverse=True)
     if (step := data.get("step", None)) is not None:
-        rows, counts = torch.stack([index, step.reshape(-1)]).unique(dim=1, return_counts=True)
+        size = int(step.max()) + 1
+        places, counts = (index * size + step.reshape(-1)).unique(return_counts=True)
         if (counts > 1).any():
-            number, at = rows[:, counts.argmax()].tolist()
+            number, at = divmod(int(places[counts.argmax()]), size)
             raise BMRLError(
                 f"episode {int(episodes[number])} has step {at} {int(counts.max())} times; valid: "
                 "one number for each episode, as torchrl_bmrl.data.replay.number_episodes gives"

@@ -13,7 +13,7 @@ from torchrl_bmrl.experts.settings import ExpertSettings, experts_of
 from torchrl_bmrl.functional import ACTING_RULES, TARGET_RULES
 from torchrl_bmrl.objectives.checks import check_value_bounds
 from torchrl_bmrl.objectives.common import LOSS_FUNCTIONS
-from torchrl_bmrl.objectives.distillation import CONTEXTS, ENCODER_TERMS
+from torchrl_bmrl.objectives.distillation import ARRANGING_TERMS, CONTEXTS, ENCODER_TERMS
 from torchrl_bmrl.objectives.generative import KL_REDUCTIONS
 from torchrl_bmrl.pipeline.agents import GENERATORS
 from torchrl_bmrl.pipeline.student import LATENT_SOURCES, OF_SETS, TASK_ENCODERS
@@ -124,7 +124,7 @@ class BCQSettings:
             raise ConfigError(f"bcq.action_chunk is {self.action_chunk}; valid for {where}: 1")
 
 
-OF_SEVERAL_TASKS = ("mixing_fraction", "metric_weight", "distance_weight", "contrastive_weight")
+OF_SEVERAL_TASKS = ("mixing_fraction", *(f"{term}_weight" for term in ARRANGING_TERMS))
 """Settings of stage 2 that compare tasks."""
 
 

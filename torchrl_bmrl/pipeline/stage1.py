@@ -22,7 +22,7 @@ from torchrl_bmrl.pipeline.learners import Agents
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.pipeline.settings import Settings
 from torchrl_bmrl.pipeline.training_data import training_data
-from torchrl_bmrl.rows import write_rows
+from torchrl_bmrl.rows import success_cell, write_rows
 from torchrl_bmrl.run.loggers import close_logger, log_metrics, make_logger
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.training.diagnostics import (
@@ -231,7 +231,7 @@ def _play(run: Run, task: str, loss: BCQLoss, epoch: int, update: int) -> list[d
             "update": update,
             "episode": i,
             "return": outcome.episode_return,
-            "success": "" if outcome.success is None else int(outcome.success),
+            "success": success_cell(outcome.success),
         }
         for i, outcome in enumerate(run.play(run.task(task), policy, seeds=seeds))
     ]

@@ -25,7 +25,7 @@ from torchrl_bmrl.pipeline.task_files import check_playable, with_run_options
 from torchrl_bmrl.reports import Section, write_study
 from torchrl_bmrl.reports.explorer import StoredExplorer
 from torchrl_bmrl.reports.members import Member, explore_members
-from torchrl_bmrl.rows import number, or_nothing, read_rows, whole, write_rows
+from torchrl_bmrl.rows import number, or_nothing, read_rows, success_cell, whole, write_rows
 from torchrl_bmrl.run.folder import open_run
 from torchrl_bmrl.run.workers import Report
 from torchrl_bmrl.studies.families_films import film_once, why_no_films
@@ -295,7 +295,7 @@ def _play(
         {
             **known,
             "return": outcome.episode_return,
-            "success": "" if outcome.success is None else int(outcome.success),
+            "success": success_cell(outcome.success),
             "data_return": data,
         }
         for known, outcome, data in zip(episodes, outcomes, returns, strict=True)

@@ -32,7 +32,7 @@ from torchrl_bmrl.modules.task_latent import check_reads_transitions
 from torchrl_bmrl.pipeline.run import Run
 from torchrl_bmrl.reports import Section, Table, write_study
 from torchrl_bmrl.reports.tables import MISSING
-from torchrl_bmrl.rows import one_of, read_rows, whole, write_rows
+from torchrl_bmrl.rows import one_of, read_rows, success_cell, whole, write_rows
 from torchrl_bmrl.run.folder import open_run
 from torchrl_bmrl.run.progress import progress
 from torchrl_bmrl.run.settings import setting
@@ -162,9 +162,8 @@ def play_job(job: tuple[Run, Job], report: Report) -> list[dict[str, Any]]:
         seeds = [run.seed("imitate", number, i) for i in range(count)]
         outcomes = run.play(task, policy, *transforms, seeds=seeds, report=report)
         rows = [
-            {**known, "stages": outcome.stages, "success": x}
+            {**known, "stages": outcome.stages, "success": success_cell(outcome.success)}
             for known, outcome in zip(episodes, outcomes, strict=True)
-            for x in ["" if outcome.success is None else str(int(outcome.success))]
         ]
         write_rows(path, rows)
 

@@ -32,7 +32,7 @@ from torchrl_bmrl.pipeline.training_data import training_data
 from torchrl_bmrl.reports.page import Section
 from torchrl_bmrl.reports.studies import write_study
 from torchrl_bmrl.reports.tables import MISSING, Table
-from torchrl_bmrl.rows import write_rows
+from torchrl_bmrl.rows import success_cell, write_rows
 from torchrl_bmrl.run.locks import lock_run
 from torchrl_bmrl.run.progress import progress
 from torchrl_bmrl.run.settings import setting
@@ -102,11 +102,11 @@ def learn_from_people(run: Run, settings: HumanSettings) -> str:
     held = {name: getattr(settings, name) for name in ("path", "task", "tracking")}
     files = {"human.path": files_of(settings.path)}
     with lock_run(folder, held, files=files), alone:
-        bounds = None
-        if alone.tasks[0].files is not None:
-            collect(alone)  # tells the units of the task's actions
-            bounds = read_original_bounds(alone.demonstrations(settings.task))
-        _convert(settings, folder / "demonstrations.hdf5", bounds or (-1.0, 1.0))
+        bounds: Bounds = (-1.0, 1.0)
+        if alone.tasks[0].files is not None:  # else the recording, which takes long, comes last
+            collect(alone)
+            bounds = read_original_bounds(alone.demonstrations(settings.task)) or bounds
+        _convert(settings, folder / "demonstrations.hdf5", bounds)
         collect(alone)
         alone.jobs(
             train_job,
@@ -188,7 +188,7 @@ def evaluate_job(job: Job, report: Report) -> list[dict[str, Any]]:
             "share": share,
             "training_seed": seed,
             "episode": row.episode,
-            "success": "" if row.success is None else int(row.success),
+            "success": success_cell(row.success),
             "return": row.episode_return,
         }
         for row in evaluate_once(run, task.name, policy, play, of=[path], report=report)
