@@ -273,6 +273,11 @@ def test_a_file_with_another_number_of_episodes_is_refused(collected: dict[str, 
     assert collected["reach"].read_bytes() == before
 
 
+def test_a_file_of_another_seed_is_refused(collected: dict[str, Path]) -> None:
+    with pytest.raises(DataError, match=r"recorded with seed .*; valid: 77, or another folder"):
+        run(collected["reach"].parent, {"reach": 2}, seed=77)
+
+
 def test_fewer_episodes_than_a_killed_run_had_finished_are_enough(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -194,6 +194,20 @@ def test_the_reference_is_the_scripted_expert_without_noise_and_with_default_gai
     assert [each.episode_return for each in outcomes] == [pytest.approx(0.0 + 1.0 + 0.7)] * 2
 
 
+def test_an_expert_that_tells_no_success_has_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Run(settings(tmp_path, default=MIXTURE))
+    (task,) = run.tasks
+
+    def record(*args: Any, **options: Any) -> Any:
+        return replace(task.record(*args, **options), extras={})
+
+    monkeypatch.setattr(run, "tasks", (replace(task, record=record),))
+    (outcome,) = reference_outcomes(run, "waving", [7])
+    assert outcome.success is None
+
+
 def test_the_reference_is_played_once_on_the_starts_of_the_evaluation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

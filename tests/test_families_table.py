@@ -122,6 +122,11 @@ def test_runs_of_one_family_are_put_together(runs: list[Path]) -> None:
         ]
 
 
+def test_one_run_tells_nothing_of_other_training_seeds(runs: list[Path]) -> None:
+    for table in combine(runs[:1]).values():
+        assert "the variation over members" in table.caption
+
+
 def test_shares_and_differences_are_paired_by_run_member_and_episode(runs: list[Path]) -> None:
     found = combine(list(reversed(runs)))  # rows of the runs are matched, in whatever order
     studies = [read_study(run) for run in runs]

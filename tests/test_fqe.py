@@ -325,6 +325,8 @@ def test_dropout_of_the_policy_is_off() -> None:
     loss, data = make_fqe_loss(policy=dropped.train()).train(), transitions(8)
     first, second = (loss(data)["next_state_value"] for _ in range(2))
     assert torch.equal(first, second)
+    assert loss.train().qvalue_network.training
+    assert torch.equal(loss(data)["next_state_value"], first)
     assert dropped.training
 
 

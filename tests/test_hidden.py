@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 pytest.importorskip("tqdm")
 from torchrl_bmrl.envs.hidden import LiftToHeight, PushTowards, ReachAtSpeed, ReachHidden
@@ -169,3 +170,15 @@ def test_the_speed_of_a_reach_is_measured_without_the_time_after_its_arrival() -
     way = (torch.arange(100, dtype=torch.float64) * 0.004).clamp(max=0.2)  # 4 mm a step, 50 steps
     eef = torch.stack([way, torch.zeros(100), torch.ones(100)], 1)
     assert moved_speed(observations(eef, eef)) == (pytest.approx(80, rel=0.05),)
+
+
+def test_the_distance_to_a_hidden_goal_is_unknown() -> None:
+    """The goal that the observation shows is then the end-effector's own position."""
+    evaluate = pytest.importorskip("torchrl_bmrl.pipeline.evaluate", exc_type=ImportError)
+    eef = torch.rand(5, 3)
+    hidden = TensorDict({"robot0_eef_pos": eef, "goal_pos": eef}, [5])
+    assert np.isnan(evaluate._distance(hidden)).all()
+    shown = TensorDict(
+        {"robot0_eef_pos": eef, "goal_pos": eef + torch.tensor([0.0, 0.0, 0.1])}, [5]
+    )
+    assert np.allclose(evaluate._distance(shown), 0.1)

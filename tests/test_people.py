@@ -17,8 +17,11 @@ pytest.importorskip("safetensors")
 pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
+import numpy as np
+from episode_files import make_episode
 from small_runs import HORIZON, TASKS, study_run, times
 
+from torchrl_bmrl.data.robomimic import open_episodes, write_episodes
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.pipeline import (
     Run,
@@ -87,6 +90,25 @@ def test_recordings_of_a_sawyer_are_refused_beside_another_arm(
         study_run(tmp_path / "run", robot="Panda") as run,
     ):
         learn_from_people(run, values)
+
+
+@pytest.mark.parametrize("files", [False, True])
+def test_human_actions_get_the_units_of_the_tasks_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, files: bool
+) -> None:
+    """Those of the imported demonstrations, or [-1, 1] of recorded ones."""
+    human = make_episode(0)
+    write_episodes(tmp_path / "human.hdf5", [human], env_args={}, bounds=(-2, 2))
+    own = {"demonstrations": str(tmp_path / "human.hdf5"), "env": "Pendulum-v1"}
+    monkeypatch.setattr(people, "collect", lambda run: None)
+    monkeypatch.setattr(people, "read_original_bounds", lambda path: (-4.0, 4.0))
+    monkeypatch.setattr(Run, "jobs", lambda *_, **__: pytest.fail("enough"))
+    settings = Settings(run_dir=str(tmp_path / "run"), tasks={"lift": own} if files else ["lift"])
+    with pytest.raises(pytest.fail.Exception, match="enough"), Run(settings) as run:
+        learn_from_people(run, HumanSettings(path=str(tmp_path / "human.hdf5"), task="lift"))
+    with open_episodes(tmp_path / "run" / "human" / "demonstrations.hdf5") as episodes:
+        (episode,) = episodes.values()
+    assert np.allclose(episode.actions, human.actions / (4 if files else 1), atol=1e-6)
 
 
 def test_the_verdict_on_human_data_follows_from_the_interval() -> None:

@@ -16,6 +16,7 @@ from torchrl.objectives import HardUpdate, LossModule, SoftUpdate, ValueEstimato
 
 from torchrl_bmrl.errors import BMRLError
 from torchrl_bmrl.objectives import OfflineLoss, StackedLoss
+from torchrl_bmrl.testing.wrappers import with_dropout
 from torchrl_bmrl.training import gradient_step, make_adam
 
 pytestmark = pytest.mark.filterwarnings(NO_UPDATER)
@@ -188,6 +189,20 @@ def test_gradients_of_one_member_stay_with_it(deactivate_vmap: bool) -> None:
         assert rows[1] > 0
         assert rows[0] == rows[2] == 0
     assert all(p.grad is None for p in stack.generator_params.parameters())
+
+
+def test_eval_turns_the_dropout_of_all_members_off() -> None:
+    made = [CASES["bcq"].make(edit=with_dropout) for _ in range(2)]
+    stack, plain = (StackedLoss(x) for x in (made, [CASES["bcq"].make() for _ in range(2)]))
+    plain.load_state_dict(stack.state_dict())
+    data = torch.stack([CASES["bcq"].batch() for _ in range(2)])
+
+    def values(loss: StackedLoss) -> Tensor:
+        torch.manual_seed(0)
+        return loss(data.clone())["loss_qvalue"]
+
+    assert not torch.equal(values(stack), values(plain))
+    assert torch.equal(values(stack.eval()), values(plain))
 
 
 @vmap_or_loop

@@ -17,6 +17,7 @@ pytest.importorskip("scipy")
 pytest.importorskip("tqdm")
 
 from torchrl_bmrl.evaluation import ResultRow
+from torchrl_bmrl.reports.tables import MISSING
 from torchrl_bmrl.studies import baselines, imitation, interpolation_report, people
 from torchrl_bmrl.studies.imitation import ImitateSettings
 
@@ -46,6 +47,8 @@ def test_imitation_counts_the_tasks_done_and_resamples_within_each_demonstration
     assert len(table.rows) == len(imitation.METHODS) * len(imitation.PERTURBATIONS)
     for line in table.rows:
         assert list(line[2:]) == ["75%", "50%", "50%", "[50%, 50%]", "4"]
+    unknown = imitation.make_table(IMITATE, ["Reach", "Lift"], [r | {"success": ""} for r in rows])
+    assert all(list(line[4:6]) == [MISSING, MISSING] for line in unknown.rows)
 
 
 @pytest.mark.parametrize(
