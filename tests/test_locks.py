@@ -19,7 +19,7 @@ pytest.importorskip("filelock")
 pytest.importorskip("yaml")
 
 from torchrl_bmrl.errors import DataError, FolderInUseError
-from torchrl_bmrl.run.locks import lock, lock_run
+from torchrl_bmrl.run.locks import WHOLE_RUN, lock, lock_run
 
 HOLDING = """
 import sys
@@ -43,7 +43,7 @@ def held(folder: Path, *names: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def test_a_folder_in_use_is_refused_with_the_owners_process_and_host(tmp_path: Path) -> None:
-    with held(tmp_path, "run") as owner:
+    with held(tmp_path, WHOLE_RUN) as owner:
         with pytest.raises(FolderInUseError) as caught, lock(tmp_path):
             pass
         assert (caught.value.process, caught.value.host) == (str(owner.pid), socket.gethostname())
@@ -53,11 +53,11 @@ def test_a_folder_in_use_is_refused_with_the_owners_process_and_host(tmp_path: P
 
 
 def test_what_a_killed_process_held_is_taken_over(tmp_path: Path) -> None:
-    with held(tmp_path, "run", "lift") as owner:
+    with held(tmp_path, WHOLE_RUN, "lift") as owner:
         owner.send_signal(signal.SIGKILL)
         owner.wait()
-    with lock(tmp_path, ["lift", "run"]):
-        said = (tmp_path / ".locks" / "run.json").read_text()
+    with lock(tmp_path, ["lift", WHOLE_RUN]):
+        said = (tmp_path / ".locks" / f"{WHOLE_RUN}.json").read_text()
     assert f'"process": {os.getpid()}' in said
 
 
@@ -72,8 +72,8 @@ def test_parts_are_held_each_for_itself_and_none_when_one_is_refused(tmp_path: P
 
 
 def test_a_damaged_note_of_the_owner_still_refuses(tmp_path: Path) -> None:
-    with held(tmp_path, "run"):
-        (tmp_path / ".locks" / "run.json").write_text("{")
+    with held(tmp_path, WHOLE_RUN):
+        (tmp_path / ".locks" / f"{WHOLE_RUN}.json").write_text("{")
         with pytest.raises(FolderInUseError, match="process unknown"), lock(tmp_path):
             pass
 
@@ -109,7 +109,7 @@ def test_links_that_no_file_is_changed_through_stay(tmp_path: Path) -> None:
 def test_a_lock_empties_no_file_that_it_is_a_link_to(tmp_path: Path) -> None:
     (tmp_path / ".locks").mkdir()
     (tmp_path / "other").write_text("content")
-    (tmp_path / ".locks" / "run.lock").symlink_to(tmp_path / "other")
+    (tmp_path / ".locks" / f"{WHOLE_RUN}.lock").symlink_to(tmp_path / "other")
     with pytest.raises(OSError, match=r"run\.lock"), lock(tmp_path):
         pass
     assert (tmp_path / "other").read_text() == "content"

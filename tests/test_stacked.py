@@ -194,7 +194,6 @@ def test_gradients_of_one_member_stay_with_it(deactivate_vmap: bool) -> None:
 def test_eval_turns_the_dropout_of_all_members_off() -> None:
     made = [CASES["bcq"].make(edit=with_dropout) for _ in range(2)]
     stack, plain = (StackedLoss(x) for x in (made, [CASES["bcq"].make() for _ in range(2)]))
-    plain.load_state_dict(stack.state_dict())
     data = torch.stack([CASES["bcq"].batch() for _ in range(2)])
 
     def values(loss: StackedLoss) -> Tensor:

@@ -43,7 +43,7 @@ from torchrl_bmrl.pipeline.task_files import (
     with_run_options,
 )
 from torchrl_bmrl.run.folder import check_files, check_made_from
-from torchrl_bmrl.run.locks import lock_run
+from torchrl_bmrl.run.locks import WHOLE_RUN, lock_run
 from torchrl_bmrl.run.workers import Report, derive_seed, run_jobs
 from torchrl_bmrl.tasks import Task, compose_tasks, import_module_of
 
@@ -104,7 +104,7 @@ class Run:
 
     def __enter__(self) -> Run:
         # Jobs that train only some tasks lock these, so that other jobs can train the rest.
-        parts = self.settings.only or ["_run", *self.names]  # no task can have this name
+        parts = self.settings.only or [WHOLE_RUN, *self.names]
         settings, defaults = asdict(self.settings), asdict(Settings())
         with ExitStack() as opened:
             files = input_files(self.settings, self.tasks)

@@ -19,8 +19,12 @@ with needs("recipes"):
     from filelock import FileLock, Timeout
 
 
+WHOLE_RUN = "_run"
+"""The part that a run of all tasks locks beside them; no task can have this name."""
+
+
 @contextlib.contextmanager
-def lock(folder: Path, names: Sequence[str] = ("run",)) -> Iterator[None]:
+def lock(folder: Path, names: Sequence[str] = (WHOLE_RUN,)) -> Iterator[None]:
     """Locks a folder, or named parts of it, for this process.
 
     The operating system releases the locks of a process when it ends, also when it is killed. The
@@ -92,7 +96,7 @@ def check_no_linked_folders(folder: str | os.PathLike[str]) -> None:
 def lock_run(
     run_dir: Path,
     settings: Mapping[str, Any],
-    names: Sequence[str] = ("run",),
+    names: Sequence[str] = (WHOLE_RUN,),
     defaults: Mapping[str, Any] | None = None,
     files: Files | None = None,
 ) -> Iterator[None]:
